@@ -40,9 +40,11 @@ class AlarmKeeper:
         self._file = AlarmFile(path)
         self._is_kept = True
         try:
-            self._list.restore(self._file.load())
-        except (OSError, ValueError, TypeError) as error:
-            server.log("error", "alarms of before lost", path=path, why=str(error))
+            why = self._list.restore(self._file.load())
+        except (OSError, ValueError) as error:
+            why = str(error)
+        if why:
+            server.log("error", "alarms of before lost", path=path, why=why)
         for alarm in self:  # of all others their drivers tell soon what is the matter now
             if alarm.what == "fault":
                 self.take(alarm.node, alarm.device, "fault", Severity.NONE, "")

@@ -8,8 +8,10 @@ Concurrency: everything runs in the daemon's loop.
 
 from __future__ import annotations
 
+import errno
 import json
 import os
+import stat
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import asdict, dataclass
@@ -123,19 +125,22 @@ class AlarmList:
             elif alarm.what not in ("link", "driver") and alarm.severity:
                 self.take(alarm.node, device, alarm.what, Severity.INVALID, text, now_s)
 
-    def restore(self, entries: Iterable[dict[str, Any]]) -> None:
+    def restore(self, entries: Iterable[object]) -> str:
         """Go on with what was kept; what holds no more is told by its driver.
 
-        Raises:
-            TypeError, ValueError: they were not kept by ``entries``.
+        Returns:
+            Why entries were left out that ``entries`` has not made, '' for none.
         """
-        for entry in entries:
-            alarm = Alarm(**entry)
-            for field, kind in Alarm.__annotations__.items():
-                value = getattr(alarm, field)
-                if type(value).__name__ != kind and not (kind == "float" and type(value) is int):
-                    raise ValueError(f"{field} is {value!r}; want {kind}")
+        why = ""
+        for number, entry in enumerate(entries):
+            try:
+                alarm = _checked(entry)
+            except (TypeError, ValueError) as error:
+                why = why or f"entry {number}: {error}"
+                continue
             self._alarms[alarm.node, alarm.what] = alarm
+            self._drop()
+        return why
 
     def entries(self) -> list[dict[str, Any]]:
         """Return what is to be kept."""
@@ -145,6 +150,37 @@ class AlarmList:
         if len(self._alarms) > MOST:
             first = min(self._alarms.values(), key=lambda alarm: (bool(alarm.severity), alarm.since))
             del self._alarms[first.node, first.what]
+
+
+_WHOLE = {"severity": max(Severity), "worst": max(Severity), "times": 1 << 53}
+"""Greatest values of the whole numbers of an alarm."""
+_TEXTS = {"node": 256, "device": 256, "what": 64, "text": 400, "by": 256, "note": 200}
+"""Characters of its texts at most."""
+_LAST_S = 1e11
+
+
+def _checked(entry: object) -> Alarm:
+    """Return the alarm that an entry of a file says.
+
+    Raises:
+        TypeError, ValueError: it is none.
+    """
+    if not isinstance(entry, dict):
+        raise TypeError(f"a {type(entry).__name__}; want a table")
+    alarm = Alarm(**entry)
+    for field in Alarm.__annotations__:
+        value = getattr(alarm, field)
+        if field in _TEXTS:
+            good = type(value) is str and len(value) <= _TEXTS[field] and value.isprintable()
+        elif field in _WHOLE:
+            good = type(value) is int and 0 <= value <= _WHOLE[field]
+        else:
+            good = type(value) in (int, float) and 0 <= value < _LAST_S
+        if not good:
+            raise ValueError(f"{field} is {printable(repr(value)[:200], 80)}")
+    if not (alarm.node and alarm.what):
+        raise ValueError("no node, or nothing that is watched")
+    return alarm
 
 
 class AlarmFile:
@@ -157,22 +193,37 @@ class AlarmFile:
     def __init__(self, path: str) -> None:
         self.path = path
 
-    def load(self) -> list[dict[str, Any]]:
+    def load(self) -> list[object]:
         """Return what was kept.
 
         Raises:
             OSError, ValueError: it cannot be read, or is damaged.
         """
         try:
-            fd = os.open(self.path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK)
+            fd = self._open(os.O_RDONLY)
         except FileNotFoundError:
             return []
-        with open(fd, "rb") as file:
-            line = file.read(LARGEST).partition(b"\n")[0]
-        found = json.loads(line or b"[]")
-        if not isinstance(found, list) or not all(isinstance(each, dict) for each in found):
+        try:
+            line = os.read(fd, LARGEST + 1).partition(b"\n")[0]
+        finally:
+            os.close(fd)
+        if len(line) > LARGEST:
+            raise ValueError(f"it is larger than {LARGEST >> 20} MiB")
+        try:
+            found = json.loads(line or b"[]")
+        except RecursionError:
+            raise ValueError("lists nested too deep") from None
+        if not isinstance(found, list):
             raise ValueError("it is not a list of alarms")
         return found
+
+    def _open(self, how: int) -> int:
+        """Open the file, waiting for nobody."""
+        fd = os.open(self.path, how | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600)
+        if not stat.S_ISREG(os.fstat(fd).st_mode):
+            os.close(fd)
+            raise OSError(errno.EINVAL, "it is not a regular file", self.path)
+        return fd
 
     def keep(self, entries: list[dict[str, Any]]) -> None:
         """Keep alarms; without any there is no file.
@@ -185,8 +236,7 @@ class AlarmFile:
                 os.unlink(self.path)
             return
         data = json.dumps(entries, separators=(",", ":")).encode() + b"\n"
-        flags = os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        fd = os.open(self.path, flags, 0o600)
+        fd = self._open(os.O_WRONLY | os.O_CREAT)
         try:
             os.pwrite(fd, data, 0)  # one line in one call: a kill leaves the old one or this one
             os.ftruncate(fd, len(data))

@@ -109,7 +109,7 @@ class Loader:
 
     def _start(self) -> None:
         try:
-            self._text = _read(self._path)
+            self._text = read_config(self._path)
         except (OSError, UnicodeDecodeError) as error:
             why = error.strerror if isinstance(error, OSError) else str(error)
             self._end(None, [f"read configuration {self._path}: {str(why).lower()}"])
@@ -282,7 +282,7 @@ def why_no_alarm(alarm: AlarmTable, node: Node | None, names: NameTable) -> str:
     return ""
 
 
-def _read(path: str) -> str:
+def read_config(path: str) -> str:
     """Return the text of a configuration.
 
     Raises:

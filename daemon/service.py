@@ -17,7 +17,7 @@ from .config import Config, parse
 from .fork_server import ForkServer
 from .fork_server_process import ForkServerProcess
 from .listening import Listening
-from .loading import Loader, NotDescribed, Plan
+from .loading import Loader, NotDescribed, Plan, read_config
 from .log import Log
 from .loop import Loop
 from .needs import this_machine, told
@@ -140,11 +140,8 @@ def _status(errors: Sequence[str]) -> int:
 def _listen(config_path: str, given: str | None) -> tuple[Listening, str]:
     """Return the listening socket, and the path of the record of stops."""
     config: Config | None = None
-    try:
-        with open(config_path, encoding="utf-8") as file:
-            config, _ = parse(file.read(), os.path.dirname(config_path))
-    except (OSError, UnicodeDecodeError):
-        pass  # the loader will report it, with all other errors
+    with suppress(OSError, UnicodeDecodeError):  # the loader will report it, with all other errors
+        config, _ = parse(read_config(config_path), os.path.dirname(config_path))
     table = config.workcell if config else None
     path = given or (table.socket if table else "") or socket_path()
     listening = Listening(path, int(table.socket_mode, 8) if table else 0o660, table.socket_group if table else "")

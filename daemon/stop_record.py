@@ -11,6 +11,7 @@ import contextlib
 import errno
 import fcntl
 import os
+import stat
 import threading
 import time
 from collections.abc import Mapping
@@ -22,6 +23,8 @@ from .realtime import end_promptly
 
 MOST_BYTES = 1 << 18
 """From so many bytes after the last checkpoint on, there is a new one, and what lies before it is freed."""
+LARGEST = 1 << 26
+"""Bytes of the file that are read at the start: a longer one was not written by us, and counts as damaged."""
 _KEEP_SIZE, _PUNCH_HOLE, _BLOCK = 0x01, 0x02 | 0x01, 4096
 
 
@@ -44,7 +47,10 @@ class StopRecord:
         self.path = path
         os.makedirs(os.path.dirname(path) or ".", mode=0o750, exist_ok=True)
         flags = os.O_RDWR | os.O_APPEND | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW
-        self._fd = os.open(path, flags, 0o600)
+        self._fd = os.open(path, flags | os.O_NONBLOCK, 0o600)
+        if not stat.S_ISREG(os.fstat(self._fd).st_mode):
+            os.close(self._fd)
+            raise OSError(errno.EINVAL, "it is not a regular file")
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
@@ -53,7 +59,7 @@ class StopRecord:
         self.drivers_fd = os.open(path, flags, 0o600)  # without the lock: drivers may outlive the daemon
         self._journal = StopJournal(self._fd)
         size = os.fstat(self._fd).st_size
-        start = _first_byte(self._fd, size)
+        start = max(_first_byte(self._fd, size), size - LARGEST)
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
         self.by_drivers: list[Mapping[str, Any]] = []
         self._at = size

@@ -93,7 +93,7 @@ class SimForce(TickDriver):
         _sensor(settings, _flaws(settings.flaws_file))
         what = ""
         if settings.model_file:
-            what = f"model {zlib.crc32(Path(settings.model_file).read_bytes()):08x}"
+            what = f"model {zlib.crc32(read_bytes(Path(settings.model_file))):08x}"
         units = ("N",) * 3 + ("N*m",) * 3
         channels = tuple(
             ChannelInfo(component, unit, -limit, limit, description=what)

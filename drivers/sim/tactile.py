@@ -92,7 +92,7 @@ class SimTactile(TickDriver):
         elements = _check(settings)
         what = "radial compression"
         if settings.model_file:
-            what += f", model {zlib.crc32(Path(settings.model_file).read_bytes()):08x}"
+            what += f", model {zlib.crc32(read_bytes(Path(settings.model_file))):08x}"
         channels = tuple(ChannelInfo(f"e{index}", "%", description=what) for index in range(elements))
         felt = (
             settings.force_node,

@@ -19,6 +19,8 @@ import os
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
+from .text import printable
+
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any, TypeAlias
@@ -28,7 +30,7 @@ if TYPE_CHECKING:
 
 NODE, WORKCELL, CHECKPOINT, PID = "node", "workcell", "checkpoint", "pid"
 MOST_PARTS = 1 << 20
-"""Channels, and bits of a channel, that an entry may name."""
+"""Channels, and bits of channels, that an entry may name, and that may be stopped in all."""
 LAST_S = 1e11
 """No entry is of a later time [s since 1970]: a calendar could not show it."""
 _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError)
@@ -73,9 +75,13 @@ def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
 
 
 def _unpacked(runs: Iterable[Iterable[int]]) -> Iterable[tuple[int, int]]:
+    left = MOST_PARTS
     for first, last, bits in runs:
         if not (0 <= first <= last < MOST_PARTS and 0 < bits < 1 << 64):
             raise ValueError(f"channels {first} to {last}, bits {bits:#x}")
+        left -= (last - first + 1) * bits.bit_count()
+        if left < 0:
+            raise ValueError(f"more than {MOST_PARTS} parts")
         for channel in range(first, last + 1):
             yield from ((channel, bit) for bit in range(bits.bit_length()) if bits >> bit & 1)
 
@@ -100,7 +106,7 @@ class Stopped:
         Raises:
             ValueError, TypeError, LookupError, ArithmeticError: it is none.
         """
-        stop, by = bool(entry["stop"]), str(entry["by"])
+        stop, by = bool(entry["stop"]), printable(str(entry["by"]), 400)
         if WORKCELL in entry:
             if not stop:
                 self.workcell, self.since_s = "", 0.0
@@ -110,7 +116,9 @@ class Stopped:
                     raise ValueError(f"at {at} s")
                 self.workcell, self.since_s = by or "somebody", self.since_s or at
             return
-        name, device, block = str(entry[NODE]), str(entry["device"]), str(entry["block"])
+        name, device, block = (printable(str(entry[key]), 256) for key in (NODE, "device", "block"))
+        if stop and len(self.parts) > MOST_PARTS:
+            raise ValueError(f"more than {MOST_PARTS} parts")
         for channel, bit in _unpacked(entry["parts"]):
             if stop:
                 self.parts.setdefault((device, block, channel, bit), (by, name))
@@ -133,7 +141,7 @@ class Stopped:
     def still(self, entry: Mapping[str, Any]) -> list[Part]:
         """Return the parts of the stop of a node that are stopped still; none for what is no such stop."""
         try:
-            device, block = str(entry["device"]), str(entry["block"])
+            device, block = printable(str(entry["device"]), 256), printable(str(entry["block"]), 256)
             parts = [(device, block, *part) for part in _unpacked(entry["parts"])] if entry["stop"] else []
         except _DAMAGE:
             return []
@@ -196,8 +204,8 @@ def _from_checkpoint(place: int, checkpoint: Mapping[str, Any], start: int, now_
     try:
         for entry in checkpoint[CHECKPOINT]:
             state.apply(entry)
-        if (at := int(checkpoint["from"])) > place:
-            raise ValueError(f"it is of byte {at}, which lies behind it")
+        if not start <= (at := int(checkpoint["from"])) <= place:
+            raise ValueError(f"it is of byte {at}; want {start} to {place}")
         return state, at
     except _DAMAGE:
         state.take(None, "its checkpoint cannot be read", now_s)

@@ -103,6 +103,8 @@ def offset_of(entry: Entry, settings: AxisSettings, raw: float) -> tuple[float |
         return None, "it was not known to be at rest when its driver ended"
     if not np.isfinite(raw):
         return None, "its device does not report its position"
+    if not np.isfinite(entry.position - entry.raw):
+        return None, "what was kept of it is not a number"
     if rule.when == "always":
         return entry.position - raw, ""
     if not abs(raw - entry.raw) <= rule.tolerance:
@@ -144,7 +146,7 @@ class PositionFile:
     def _read(self, path: str, boot: str) -> Mapping[str, Entry]:
         """Return the entries of the file before this one that can be believed."""
         try:
-            with open(path, "rb") as file:
+            with open(path, "rb", opener=_at_once) as file:
                 contents = decode(file.read(MOST_BYTES))
         except FileNotFoundError:
             return {}
@@ -199,6 +201,10 @@ class PositionFile:
         self._map.flush()
         CLOSED.pack_into(self._map, CLOSED_AT, 1)
         self._map.flush()
+
+
+def _at_once(path: str, flags: int) -> int:
+    return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would hold up the driver
 
 
 def _replace(path: str, data: bytes) -> int:

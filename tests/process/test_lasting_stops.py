@@ -118,6 +118,17 @@ def test_all_stops_outlive_the_daemon_and_its_drivers(start_daemon: Callable[...
     third = start_daemon(CELL, at=daemon.folder)
     assert not status(third)["stopped_ns"] and not status(third)["node_stops"]
     works(third)
+    kill(third)
+    stops = Path(daemon.socket + ".stops")
+    stops.write_text(stops.read_text() + '{"node":"mod0","device":"mod0","block":"","parts":[[0,1e9,1]],"stop":true}\n')
+    Path(f"{stops}.alarms").write_text("[" * 100_000)
+    fourth = start_daemon(CELL, at=daemon.folder)  # what is damaged keeps nobody from starting, stopped
+    assert "journal of stops, which is damaged" in status(fourth)["stop_source"]
+    is_refused(fourth, "mod0.xaxis")
+    with fourth.cell() as cell:
+        assert not cell.alarms()
+        cell.reset()
+    works(fourth)
 
 
 def test_an_orderly_end_keeps_the_stop_too(start_daemon: Callable[..., Daemon]) -> None:

@@ -1,5 +1,9 @@
 """The daemon's list of alarms: latched until they are over and acknowledged, kept over its end."""
 
+import json
+import math
+import os
+
 import pytest
 
 from sioms.daemon.alarms import MOST, AlarmFile, AlarmList
@@ -79,9 +83,56 @@ def test_they_outlive_the_daemon(alarms, tmp_path):
     assert not (tmp_path / "stops.alarms").exists()
 
 
-@pytest.mark.parametrize("text", ["{}", "[1]", '[{"node": "x"}]', '[{"nod', "\x00"])
-def test_a_damaged_file_is_told(tmp_path, text):
+GOOD = {"node": "m.x", "device": "m", "what": "force", "severity": 1, "text": "force 3 N", "since": 1.0}
+
+
+def restored(path):
+    """Return the alarms that a daemon finds in a file, and why it left some out."""
+    alarms = AlarmList()
+    try:
+        return alarms, alarms.restore(AlarmFile(str(path)).load())
+    except (OSError, ValueError) as error:  # what AlarmKeeper takes for a list that is lost
+        return alarms, str(error)
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["{}", "[1]", '[{"node": "x"}]', '[{"nod', "\x00", "[" * 200_000, "[" + "9" * 5000 + "]", '"' * (1 << 21), "\udcff"]
+    + [json.dumps([{**GOOD, name: value}]) for name, value in (
+        ("severity", 17), ("severity", 10**30), ("severity", True), ("worst", -1), ("times", 1e3), ("since", math.nan),
+        ("since", math.inf), ("at", -1.0), ("node", ""), ("node", "\ud800"), ("text", "\x1b[2J"), ("by", "x" * 300),
+        ("what", ["force"]), ("more", 1),
+    )],
+)  # fmt: skip
+def test_a_damaged_file_is_told_and_gives_no_alarm_that_could_not_be_shown(tmp_path, text):
     path = tmp_path / "stops.alarms"
-    path.write_text(text)
-    with pytest.raises((ValueError, TypeError)):
-        AlarmList().restore(AlarmFile(str(path)).load())
+    path.write_bytes(text.encode("utf-8", "surrogateescape"))
+    alarms, why = restored(path)
+    assert why and not list(alarms)
+
+
+def test_of_a_file_that_is_damaged_in_part_the_rest_is_kept(tmp_path):
+    path = tmp_path / "stops.alarms"
+    path.write_text(
+        json.dumps([{**GOOD, "severity": 9}, GOOD, 7, *[{**GOOD, "node": f"n{i}"} for i in range(2 * MOST)]])
+    )
+    alarms, why = restored(path)
+    assert "entry 0: severity is 9" in why
+    assert len(list(alarms)) == MOST
+
+
+@pytest.mark.parametrize("what", ["folder", "pipe", "link", "unreadable"])
+def test_what_is_no_file_is_told_and_holds_up_nobody(tmp_path, what):
+    path = tmp_path / "stops.alarms"
+    match what:
+        case "folder":
+            path.mkdir()
+        case "pipe":
+            os.mkfifo(path)
+        case "link":
+            path.symlink_to("/dev/zero")
+        case "unreadable":
+            path.symlink_to(path)
+    assert restored(path)[1]
+    with pytest.raises(OSError):
+        AlarmFile(str(path)).keep([GOOD])

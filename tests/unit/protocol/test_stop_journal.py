@@ -270,3 +270,48 @@ def test_a_checkpoint_of_a_place_behind_it_is_damage() -> None:
     stop = b'{"at":1.0,"workcell":"","stop":true,"by":"me"}\n'
     assert replay(b'{"checkpoint":[],"from":0}\n' + stop, 0, 5.0).workcell == "me"
     assert "checkpoint" in replay(b'{"checkpoint":[],"from":999}\n' + stop, 0, 5.0).workcell
+
+
+EVERYTHING = f"[[0,{(1 << 20) - 1},{(1 << 64) - 1}]]"
+
+
+@pytest.mark.parametrize(
+    "lines",
+    [
+        [f'{{"at":1,"node":"a","device":"d","block":"","parts":{EVERYTHING},"stop":true,"by":"x"}}'],
+        [
+            f'{{"at":1,"node":"a","device":"d{i}","block":"","parts":[[0,1048575,1]],"stop":true,"by":"x"}}'
+            for i in range(4)
+        ],
+        ['{"at":1,"checkpoint":[],"from":-5}'],
+    ],
+)
+def test_a_line_that_stops_more_than_there_can_be_is_damage(path: str, lines: list[str]) -> None:
+    os.makedirs(os.path.dirname(path))
+    Path(path).write_text("\n".join(lines) + "\n")
+    assert "damaged" in kept(path).workcell
+
+
+def test_what_a_journal_says_can_be_shown_and_sent(path: str) -> None:
+    os.makedirs(os.path.dirname(path))
+    Path(path).write_text('{"at":1,"workcell":"","stop":true,"by":"a\\ud800\\u001b[2J"}\n')
+    assert kept(path).workcell == "a\\ud800\\x1b[2J"
+
+
+def test_of_a_journal_that_nobody_of_us_wrote_the_end_is_read_and_it_is_damage(
+    path: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stop_record, "LARGEST", 10_000)
+    os.makedirs(os.path.dirname(path))
+    line = '{"at":1,"node":"a","device":"d","block":"","parts":[[0,0,1]],"stop":false,"by":"x"}\n'
+    Path(path).write_text(line * 1000)
+    record = StopRecord(path)
+    assert "damaged" in record.state.workcell
+    record.close()
+
+
+def test_what_is_no_file_keeps_no_stops(path: str) -> None:
+    os.makedirs(os.path.dirname(path))
+    os.mkfifo(path)
+    with pytest.raises(OSError, match="not a regular file"):
+        StopRecord(path)

@@ -1,6 +1,7 @@
 """Positions over a restart: files, what of them is believed, and that no interruption leaves a wrong entry."""
 
 import math
+import os
 import resource
 
 import numpy as np
@@ -282,3 +283,27 @@ def test_persistence_has_no_say_in_the_motion(tmp_path):
         rig.bank.append(records(mode=MODE.POSITION, position=0.3), [0], rig.now_ns)
         rig.run()
     assert np.array_equal(plain.trace("commanded_position"), kept.trace("commanded_position"))
+
+
+@pytest.mark.parametrize("what", ["folder", "pipe", "unreadable"])
+def test_what_is_no_file_holds_up_no_driver(tmp_path, what):
+    path = tmp_path / "mod0.positions"
+    match what:
+        case "folder":
+            path.mkdir()
+        case "pipe":
+            os.mkfifo(path)
+        case "unreadable":
+            path.symlink_to(path)
+    block = AxisBlock(BlockSpec("", NodeClass.AXIS, (ChannelInfo("x", "m"),)), Rig([axis(restore=ALWAYS)]).bank)
+    said = []
+    keep_positions(str(tmp_path), "mod0", [block], lambda level, text: said.append(text))
+    assert said and "positions are not" in said[0]
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+def test_a_place_that_is_no_number_is_not_restored(bad):
+    rule = axis(restore=ALWAYS)
+    for entry in (Entry(AT_REST, bad, 0.1), Entry(AT_REST, 0.1, bad)):
+        offset, why = offset_of(entry, rule, 0.1)
+        assert offset is None and why
