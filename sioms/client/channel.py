@@ -225,6 +225,7 @@ class Channel:
         self._timeout = 0.0
         self.keepalive_s = 0.0
         self.fellows: Sequence[Channel] = ()
+        self._others_due_s = 0.0
         self._ended: tuple[int, str] | None = None
 
     @property
@@ -286,7 +287,24 @@ class Channel:
                 self._sock.send(packet)
             except OSError as error:
                 raise self._gone(error, call.what) from None
+        if self.fellows:
+            self._keep_others()
         return number
+
+    def _keep_others(self) -> None:
+        """Renew the leases of the other channels, now and then: a request tells that this client is alive, and its
+        answer may come before anybody waits.
+        """
+        now_s = monotonic()
+        if now_s < self._others_due_s:
+            return
+        self._others_due_s = now_s + self.keepalive_s
+        for channel in self.fellows:
+            if channel is not self:
+                try:
+                    channel.notice(KEEPALIVE)
+                except OSError:
+                    continue  # who uses it hears of it there
 
     def notice(self, packet: bytes) -> None:
         """Send a packet that draws no answer."""

@@ -104,6 +104,11 @@ def test_every_call_of_a_session_renews_what_it_holds(remote: sioms.Workcell) ->
         while time.monotonic() < end_s:  # readings of another node
             force.wait_new(force.read().number, 1.0)
         assert goes_on()
+        for ask in (remote.status, force.statistics):  # answered at once: nobody waits
+            end_s = time.monotonic() + 3 * DEFAULT_LEASE_S
+            while time.monotonic() < end_s:
+                ask()
+            assert goes_on()
         axis.stop()
     with remote.open("force0"), raises(errno.ETIMEDOUT):  # with nothing to renew any more
         remote.wait_marker(remote.reserve_marker(), 2 * DEFAULT_LEASE_S)

@@ -7,13 +7,14 @@ import errno
 import os
 import socket
 import threading
+import time
 from _thread import allocate_lock
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from sioms.client.channel import Call, Channel, connect
+from sioms.client.channel import KEEPALIVE, Call, Channel, connect
 from sioms.client.overdue import GRACE_S
 from sioms.protocol.messages import ClientVerb, decode, encode, refusal, reply
 from sioms.protocol.verbs import Ioctl, Subscribe
@@ -201,3 +202,25 @@ def test_take_does_not_wait(peer: Peer) -> None:
     peer.sock.send(reply(number, 5))
     packet = peer.channel.take()
     assert packet is not None and peer.channel.result(packet).value == 5
+
+
+def test_a_request_renews_what_is_kept_alive_with_its_channel_however_soon_it_is_answered() -> None:
+    peers = [Peer() for _ in range(3)]
+    channels = [peer.channel for peer in peers]
+    for channel in channels:
+        channel.fellows, channel.keepalive_s = channels[1:], 0.01
+    peers[2].sock.close()  # who has gone disturbs nobody
+    for _ in range(2):
+        channels[0].send(Call("ask", Ioctl(1, None, None)))
+        assert peers[1].sock.recv(100) == KEEPALIVE
+        time.sleep(0.02)
+    channels[0].keepalive_s = 3600.0
+    for _ in range(3):  # and no more often than the shortest lease asks for
+        channels[0].send(Call("ask", Ioctl(1, None, None)))
+    peers[1].sock.settimeout(0.05)
+    assert peers[1].sock.recv(100) == KEEPALIVE
+    with pytest.raises(TimeoutError):
+        peers[1].sock.recv(100)
+    for peer in peers:
+        peer.channel.close()
+        peer.sock.close()
