@@ -20,6 +20,9 @@ if getattr(_sys, "argv", [])[:1] == ["-m"] and any(word.split(".")[0] == "sioms"
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from .client.command import command as command
+    from .client.fleet import Fleet as Fleet
+    from .client.fleet import FleetMarker as FleetMarker
+    from .client.fleet_verbs import FleetError as FleetError
     from .client.node import AnalogNode as AnalogNode
     from .client.node import AxisNode as AxisNode
     from .client.node import BinaryNode as BinaryNode
@@ -38,6 +41,9 @@ if TYPE_CHECKING:
 _HOME = {
     "Workcell": "client.workcell",
     "Marker": "client.workcell",
+    "Fleet": "client.fleet",
+    "FleetMarker": "client.fleet",
+    "FleetError": "client.fleet_verbs",
     "Node": "client.node",
     "AxisNode": "client.node",
     "AnalogNode": "client.node",

@@ -29,12 +29,13 @@ from sioms.protocol.socketpath import cell_address
 from .client.cell_verbs import MarkerVerbs, WorkcellVerbs
 from .client.channel import KEEPALIVE, Answer, Call, Channel, connect_channel
 from .client.faces import Awaiting
+from .client.fleet_verbs import FleetMarkerVerbs, FleetVerbs
 from .client.node_core import S
 from .client.node_verbs import AnalogVerbs, AxisVerbs, BinaryVerbs, NodeVerbs, select_nodes
 from .client.snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Coroutine, Iterable, Mapping, Sequence
 
     from .client.coordinates import AsyncUserAxis
     from .client.overdue import Overdue
@@ -292,6 +293,49 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
     cell = AsyncWorkcell(channel, _Requests(channel, verbs.Cancel), path)
     await cell._greet(name)
     return cell
+
+
+class AsyncFleetMarker(Awaiting, FleetMarkerVerbs):
+    __doc__ = FleetMarkerVerbs.__doc__
+
+
+class _Together:
+    """What waits for several cells in an event loop."""
+
+    async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+        return await self.all([cell._waiter.call(call) for cell, call in calls])
+
+    async def all(self, steps: Sequence[Coroutine[Any, Any, Any]]) -> list[Any]:
+        return await asyncio.gather(*steps, return_exceptions=True)
+
+    async def connect(self, address: str, name: str) -> AsyncWorkcell:
+        return await connect(address, name)
+
+    def close(self) -> None:
+        pass
+
+
+class AsyncFleet(Awaiting, FleetVerbs[AsyncWorkcell]):
+    """Sessions with several cells in an event loop; made by ``fleet``."""
+
+    _MARKER = AsyncFleetMarker
+
+    async def __aenter__(self) -> Self:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+
+async def fleet(
+    cells: Mapping[str, str] | Iterable[str] | str | None = None, name: str = "", *, partial: bool = False
+) -> AsyncFleet:
+    """Open sessions with several cells; see ``sioms.Fleet``."""
+    from .client.fleet_places import wanted
+
+    opened = AsyncFleet(_Together(), name)
+    await opened._connect(wanted(cells), partial)
+    return opened
 
 
 async def select(

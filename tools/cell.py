@@ -23,6 +23,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument("-v", "--verbose", action="store_true", help="also channels, bits and read-only companions")
     one.add_argument("--names", action="store_true", help="only names, one per line; nothing if no daemon is running")
     one.add_argument("--json", action="store_true", help="as JSON")
+    one.add_argument("--all", action="store_true", help="of all cells of the fleet, as CELL:NODE")
     one = subparsers.add_parser("info", help="describe a node: channels, units, limits")
     one.add_argument("node", metavar="NODE")
     one.add_argument("--json", action="store_true", help="as JSON")
@@ -31,6 +32,7 @@ def add_parser(subparsers: Any) -> None:
     subparsers.add_parser("reload", help="make the daemon reload its configuration")
     one = subparsers.add_parser("stop", help="emergency stop, latched until `sioms reset`; not a safety-rated function")
     one.add_argument("node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell")
+    one.add_argument("--all", action="store_true", help="all cells of the fleet")
     one = subparsers.add_parser(
         "wait", help="wait until the daemon is ready: all devices have started, or are in fault"
     )
@@ -52,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     """Run one of the commands; return the exit status."""
     match args.command:
         case "list":
-            return _list(args.verbose, args.names, args.json)
+            return _list_all(args) if args.all else _list(args.verbose, args.names, args.json)
         case "info":
             with Workcell(name="sioms") as cell:
                 info, status = cell.info(args.node), cell.status()
@@ -73,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
         case "wait":
             _wait(args.timeout)
         case "stop":
-            _stop(args.node)
+            _stop_all(args.node) if args.all else _stop(args.node)
         case "reset":
             with Workcell(name="sioms") as cell:
                 cell.reset(args.node)
@@ -117,6 +119,15 @@ def _stop(node: str) -> None:
             cell.emergency_stop(node, "sioms stop")
     elif unheard := emergency_stop("sioms stop", name="sioms"):
         print(f"sioms stop: stopped and latched by the drivers; {unheard}", file=sys.stderr)
+
+
+def _stop_all(node: str) -> None:
+    from sioms.client.fleet import Fleet
+
+    if node:
+        raise OSError(errno.EINVAL, f"stop {node}: --all stops every cell as a whole; leave out one of both")
+    with Fleet(name="sioms", partial=True) as fleet:
+        fleet.emergency_stop("sioms stop --all")
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
@@ -181,19 +192,37 @@ def _list(verbose: bool, names_only: bool, as_json: bool) -> int:
         return 0
     with Workcell(name="sioms") as cell:
         entries, status = cell.nodes(), cell.status()
+    _print_entries(entries, verbose, as_json, troubles(status))
+    return 0
+
+
+def _list_all(args: argparse.Namespace) -> int:
+    """List the nodes of all cells; those that are missing are told, and the exit status is 1 then."""
+    from sioms.client.fleet import Fleet
+
+    with Fleet(name="sioms", partial=True) as fleet:
+        entries = fleet.nodes()
+        lines = [f"{name}: {line}" for name, status in fleet.status().items() for line in troubles(status)[1:]]
+    if args.names:
+        print("\n".join(entry.name for entry in entries if not entry.name.endswith(READONLY)))
+    else:
+        _print_entries(entries, args.verbose, args.json, ["", *lines] if lines else [])
+    for name, error in fleet.missing.items():
+        print(f"sioms list: {name}: {error.strerror}", file=sys.stderr)
+    return 1 if fleet.missing else 0
+
+
+def _print_entries(entries: list[NodeEntry], verbose: bool, as_json: bool, more: list[str]) -> None:
     shown = entries if verbose else [entry for entry in entries if not is_part(entry, entries)]
     if as_json:
         print_json([entry_fields(entry) for entry in shown])
-        return 0
+        return
     rows = [
         (e.name, e.node_class.name.lower(), str(e.channels), "read" if e.read_only else "read, write", e.device,
          e.state, e.holder)
         for e in shown
     ]  # fmt: skip
-    print(
-        "\n".join(table(("node", "class", "channels", "access", "device", "state", "held by"), rows) + troubles(status))
-    )
-    return 0
+    print("\n".join(table(("node", "class", "channels", "access", "device", "state", "held by"), rows) + more))
 
 
 def troubles(status: dict[str, Any], device: str = "", node: str = "") -> list[str]:

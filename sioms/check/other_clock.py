@@ -64,7 +64,7 @@ def look(cell: Workcell, offset_ns: int, found: dict[str, Any]) -> None:
 
 
 def instants(cell: Workcell) -> dict[str, int]:
-    """Return how long before its answer each kind of instant lies that a session tells, of a start how long after [ns]."""
+    """Return how long ago each kind of instant of a session is, that of a start how far ahead [ns]."""
     found = {}
     marker = cell.reserve_marker()
     marker.signal()

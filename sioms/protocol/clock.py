@@ -8,6 +8,7 @@ from __future__ import annotations
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Mapping
     from enum import IntEnum
 else:
     from .enumeration import IntEnum
@@ -152,3 +153,42 @@ class Clock:
         if wall is None:
             return Utc(0, UNKNOWN_NS, "none")
         return Utc(there_ns + wall.ahead_ns, wall.error_ns, ("none", "NTP", "PTP")[wall.source])
+
+
+def starts(start_ns: int, clocks: Mapping[str, Clock], within_ns: int) -> tuple[dict[str, int], int, str]:
+    """Return one instant in the clocks of several cells, by what makes their differences least.
+
+    Args:
+        start_ns: the instant here [ns, CLOCK_MONOTONIC].
+        clocks: of the cells, by their names, each with its wall clock.
+        within_ns: how far apart the cells may be [ns].
+
+    Returns:
+        The instant in the clock of each cell, how far two are apart at most [ns], and by what: 'UTC' or 'links'.
+
+    Raises:
+        ValueError: what is known of the clocks does not do.
+    """
+    links = {name: clock.error_ns for name, clock in clocks.items()}
+    walls = {name: clock.wall or Wall(0, UNKNOWN_NS, Source.NONE) for name, clock in clocks.items()}
+    bounds = {"links": _apart(list(links.values())), "UTC": _apart([wall.error_ns for wall in walls.values()])}
+    by = min(bounds, key=bounds.__getitem__)
+    if bounds[by] > within_ns:
+        told = ", ".join(f"{name} {_text(links[name])} and {_text(walls[name].error_ns)}" for name in clocks)
+        apart = f"the cells may be {_text(bounds[by])} apart, more than {_text(within_ns)}"
+        raise ValueError(f"{apart}; errors by link and by UTC: {told}")
+    there = {name: clock.there(start_ns) for name, clock in clocks.items()}
+    if by == "UTC":
+        first = next(iter(clocks))
+        utc_ns = there[first] + walls[first].ahead_ns
+        there = {name: utc_ns - wall.ahead_ns for name, wall in walls.items()}
+    return there, bounds[by], by
+
+
+def _apart(errors: list[int]) -> int:
+    """Return how far apart two of several are at most; one alone is not."""
+    return sum(sorted(errors)[-2:]) if len(errors) > 1 else 0
+
+
+def _text(ns: int) -> str:
+    return "unknown" if ns >= UNKNOWN_NS else f"{ns / 1e3:.0f} us"

@@ -14,10 +14,13 @@ from sioms import aio
 from sioms.client import coordinates, node_verbs
 from sioms.client.cell_verbs import MarkerVerbs, WorkcellVerbs
 from sioms.client.faces import Awaiting, Blocking
+from sioms.client.fleet_verbs import FleetMarkerVerbs, FleetVerbs
 
 PAIRS = {
     sioms.Workcell: aio.AsyncWorkcell,
     sioms.Marker: aio.AsyncMarker,
+    sioms.Fleet: aio.AsyncFleet,
+    sioms.FleetMarker: aio.AsyncFleetMarker,
     sioms.AxisNode: aio.AsyncAxisNode,
     sioms.AnalogNode: aio.AsyncAnalogNode,
     sioms.BinaryNode: aio.AsyncBinaryNode,
@@ -27,6 +30,8 @@ LISTS = (
     *map(vars(node_verbs).get, ("AxisVerbs", "AnalogVerbs", "BinaryVerbs")),
     WorkcellVerbs,
     MarkerVerbs,
+    FleetVerbs,
+    FleetMarkerVerbs,
     coordinates.UserAxisVerbs,
 )
 OF_OLD = {"subscribed"}

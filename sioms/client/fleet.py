@@ -1,0 +1,90 @@
+"""A fleet of cells, the blocking face."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from typing import TYPE_CHECKING, Any, Self
+
+from .cell_verbs import WorkcellVerbs
+from .channel import Answer, Call
+from .faces import Blocking, run
+from .fleet_places import wanted
+from .fleet_verbs import FleetError, FleetMarkerVerbs, FleetVerbs
+from .workcell import Workcell
+
+if TYPE_CHECKING:
+    from collections.abc import Coroutine, Iterable, Mapping, Sequence
+
+__all__ = ["Fleet", "FleetError", "FleetMarker"]
+THREADS = 64
+"""Cells that are waited for side by side; more take turns."""
+
+
+class _Together:
+    """What waits for several cells in the blocking face: requests go out first, other steps have a thread each."""
+
+    def __init__(self) -> None:
+        self._threads: ThreadPoolExecutor | None = None
+
+    async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+        sent: list[int | OSError] = []
+        for cell, call in calls:
+            try:
+                sent.append(cell._channel.send(call))
+            except OSError as error:
+                sent.append(error)
+        answers: list[Answer | OSError] = []
+        for (cell, call), number in zip(calls, sent, strict=True):
+            try:
+                answers.append(number if isinstance(number, OSError) else cell._channel.wait(number, call))
+            except OSError as error:
+                answers.append(error)
+        return answers
+
+    async def all(self, steps: Sequence[Coroutine[Any, Any, Any]]) -> list[Any]:
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(THREADS, "fleet")
+        tasks = [self._threads.submit(run, step) for step in steps]
+        return [task.exception() or task.result() for task in tasks]
+
+    async def connect(self, address: str, name: str) -> Workcell:
+        return Workcell(address, name or None)
+
+    def close(self) -> None:
+        if self._threads is not None:
+            self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+class FleetMarker(Blocking, FleetMarkerVerbs):
+    __doc__ = FleetMarkerVerbs.__doc__
+
+
+class Fleet(Blocking, FleetVerbs[Workcell]):
+    """Sessions with several cells. Use it in a ``with`` block, or close it; the end of the process does.
+
+    Args:
+        cells: addresses by the names that the cells have, or addresses; the path of a file (``fleet_places``); None for
+            $SIOMS_FLEET or the user's own file.
+        name: what this client calls itself in messages and lists.
+        partial: whether cells may be missing; ``missing`` says why each is.
+
+    Raises:
+        OSError: EEXIST, two cells claim one name; EINVAL, a cell has another name than the fleet gives it; FleetError,
+            which cells cannot be reached.
+
+    Concurrency: may be used by many threads.
+    """
+
+    _MARKER = FleetMarker
+
+    def __init__(
+        self, cells: Mapping[str, str] | Iterable[str] | str | None = None, name: str = "", *, partial: bool = False
+    ) -> None:
+        super().__init__(_Together(), name)
+        run(self._connect(wanted(cells), partial))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()

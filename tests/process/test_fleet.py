@@ -1,0 +1,158 @@
+"""Several cells as one: names, stops, markers and starts across cells, over a socket, ZeroMQ and Zenoh."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from daemon_rig import axes, daemons, raises, wait_for
+
+import sioms
+import sioms.aio
+from sioms.check.remote import Gateway, ZenohGateway
+from sioms.tools.front import main
+
+
+def _cell(name: str) -> str:
+    return f'[workcell]\nname = "{name}"\n' + axes("mod0", "xaxis")
+
+
+@pytest.fixture(scope="module")
+def cells() -> Iterator[dict[str, str]]:
+    """Addresses of three cells: by a socket, over ZeroMQ and over Zenoh."""
+    with daemons() as start:
+        one, two, three = (start(_cell(name)) for name in ("left", "right", "top"))
+        with Gateway(two.socket) as zmq, ZenohGateway(three.socket) as zenoh:
+            for name in ("secret", "trusted"):  # one folder has what both need
+                Path(zenoh.own.file(name)).write_bytes(Path(zmq.own.file(name)).read_bytes())
+                Path(zenoh.own.file(name)).chmod(0o600)
+            yield {"left": one.socket, "right": zmq.socket, "top": zenoh.socket}
+
+
+@pytest.fixture
+def fleet(cells: dict[str, str]) -> Iterator[sioms.Fleet]:
+    """Sessions with all of them, nothing stopped."""
+    with sioms.Fleet(cells, "tester") as opened:
+        opened.reset()
+        yield opened
+
+
+def test_nodes_have_names_in_the_fleet(
+    fleet: sioms.Fleet,
+    cells: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert list(fleet) == ["left", "right", "top"]
+    names = {entry.name for entry in fleet.nodes()}
+    assert {"left:mod0", "right:mod0", "top:mod0.xaxis"} <= names
+    with fleet.open("right:mod0", "rw", lease=2.0) as node:
+        node.move(0.01)
+        assert fleet.info("right:mod0").name == "mod0" and "lease" not in fleet.status()["left"]
+    for wrong, why in (
+        ("mod0", "want CELL:NODE"),
+        ("bottom:mod0", "there are: left, right, top"),
+        ("left:none", "no such node"),
+    ):
+        with pytest.raises(OSError, match=why):
+            fleet.open(wrong)
+    file = tmp_path / "fleet.toml"
+    file.write_text("[cells]\n" + "".join(f'{name} = "{address}"\n' for name, address in cells.items()))
+    monkeypatch.setenv("SIOMS_FLEET", str(file))
+    assert main(["list", "--all"]) == 0 and "top:mod0" in capsys.readouterr().out
+    file.write_text(file.read_text() + 'gone = "/nowhere/siomsd.sock"\n')
+    assert main(["list", "--all"]) == 1
+    said = capsys.readouterr()
+    assert "left:mod0" in said.out and "gone: connect to /nowhere" in said.err
+    with pytest.raises(sioms.FleetError, match="1 of 4 cells failed: gone"):
+        sioms.Fleet()
+    assert main(["stop", "--all"]) == 1 and "gone" in capsys.readouterr().err
+    assert all(status["stopped_ns"] for status in fleet.status().values()), "the others have been stopped"
+
+
+def test_a_name_that_two_cells_claim_is_an_error(cells: dict[str, str]) -> None:
+    with raises(errno.EEXIST, f"calls itself 'left', as does the one at {cells['left']}"):
+        sioms.Fleet([cells["left"], cells["left"]])
+    with raises(errno.EINVAL, "calls itself 'left' and the fleet 'right'"):
+        sioms.Fleet({"right": cells["left"]})
+
+
+def test_a_stop_reaches_all_cells_also_when_a_session_is_lost(fleet: sioms.Fleet) -> None:
+    fleet["top"].close()
+    fleet["top"]._channel._ended = (errno.EIO, "lost")
+    with pytest.raises(OSError):
+        fleet["top"].nodes()
+    fleet.emergency_stop("enough")
+    with sioms.Fleet({name: fleet._addresses[name] for name in fleet}) as again:
+        for name, status in again.status().items():
+            assert 0 < time.monotonic_ns() - status["stopped_ns"] < 10_000_000_000, name
+        again.reset()
+
+
+def test_markers_pass_from_cell_to_cell(fleet: sioms.Fleet) -> None:
+    marker = fleet.reserve_marker()
+    with fleet.open("left:mod0", "rw") as left, fleet.open("top:mod0", "rw", lease=5.0) as top:
+        here, there = left.read().position[0], top.read().position[0]
+        top.command(position=there + 0.01, wait=marker["top"])
+        found: list[int] = []
+        waiting = threading.Thread(target=lambda: found.append(marker.wait(10.0)))
+        waiting.start()
+        time.sleep(0.1)
+        assert not top.read().in_motion[0]
+        left.command(position=here + 0.01, signal=marker[left])
+        wait_for(lambda: top.read().position[0] > there + 0.009, "the other cell to start")
+        waiting.join()
+        assert 0 <= time.monotonic_ns() - found[0] < 10_000_000_000
+    with raises(errno.ETIMEDOUT, "3 of 3 cells failed"):
+        fleet.reserve_marker().wait(0.2)
+    other = fleet.reserve_marker()
+    other.signal()
+    assert other.wait(2.0)
+    other.free()
+
+
+def test_cells_start_at_one_instant_or_not_at_all(fleet: sioms.Fleet) -> None:
+    nodes = [fleet.open(f"{name}:mod0", "rw", lease=5.0) for name in fleet]
+    try:
+        begin = [node.read().position[0] for node in nodes]
+        for node, start in zip(nodes, begin, strict=True):
+            node.command(position=start + 0.01, synch=True)
+        with raises(errno.ERANGE, "apart, more than 1 us; errors by link and by UTC: left 0 us and"):
+            fleet.synch(*nodes, within=1e-6)
+        assert not any(node.read().in_motion[0] for node in nodes)
+        at_ns = fleet.synch(*nodes, lead=0.3, within=0.1)
+        assert at_ns > time.monotonic_ns()
+        numbers = [node.read().number for node in nodes]
+        wait_for(
+            lambda: all(abs(n.read().position[0] - s) > 0.009 for n, s in zip(nodes, begin, strict=True)), "all to move"
+        )
+        firsts = []
+        for node, number, start in zip(nodes, numbers, begin, strict=True):
+            moved = [s for s in node.history(number) if abs(s.commanded_position[0] - start) > 1e-6]
+            firsts.append(moved[0].stamp_ns)
+        assert max(firsts) - min(firsts) < 30_000_000, "the same tick, as far as two machines' clocks are known"
+    finally:
+        for node in nodes:
+            node.close()
+
+
+def test_the_asyncio_face(cells: dict[str, str]) -> None:
+    async def go() -> None:
+        async with await sioms.aio.fleet(cells) as fleet:
+            assert len(await fleet.nodes()) >= 6
+            marker = await fleet.reserve_marker()
+            wait = asyncio.create_task(marker.wait(5.0))
+            await asyncio.sleep(0.05)
+            await marker["left"].signal()
+            await wait
+            await fleet.emergency_stop("enough")
+            assert all(status["stopped_ns"] for status in (await fleet.status()).values())
+            await fleet.reset()
+
+    asyncio.run(go())
