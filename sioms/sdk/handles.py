@@ -44,9 +44,13 @@ class Quota(NamedTuple):
 
 
 class Writing(Protocol):
-    """A write of axis records that is not in the buffers yet."""
+    """A write of axis records that is not in the buffers yet, or a request that comes after such writes."""
 
     lacks_room: bool
+
+    @property
+    def replaces(self) -> bool:
+        """Whether it overtakes those before it, and ends them."""
 
     def leave(self) -> None:
         """Let the later writes of the handle have their turn."""

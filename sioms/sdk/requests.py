@@ -24,7 +24,7 @@ from .driver import Awaited, Refusal
 from .handles import LATER, Handle, Wait
 from .parts import Service
 from .stops import Reason, Stop
-from .writing import check_link, end_writes
+from .writing import Behind, check_link, end_writes
 
 FEW_TICKS = 1000
 """Ticks that statistics are told of when nobody asks for more."""
@@ -150,19 +150,7 @@ def _axis_request(
             )  # fmt: skip
             return LATER
         case Request.SEND_EXTERNAL_SYNCH:
-            if argument is not None and type(argument) is not int:
-                raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as start; want a time in ns, or none for now")
-            start_ns = argument or now_ns
-            if start_ns < now_ns - service.loop.period_ns:
-                raise _refuse(
-                    errno.ETIME,
-                    f"{what}: its start time passed {(now_ns - start_ns) / 1e6:.2f} ms ago; give it more lead",
-                )
-            if start_ns > now_ns + 60_000_000_000:
-                raise _refuse(errno.EINVAL, f"{what}: starts in {(start_ns - now_ns) / 1e9:.0f} s; want at most 60 s")
-            bank.synch(axes, start_ns, now_ns)
-            service.engine.commands_written(handle.block)
-            return start_ns
+            return _synch(service, handle, number, argument, timeout_s, what)
         case Request.CALIBRATE_DEVICE:
             bank.calibrate(axes, np.array(_numbers(argument, len(axes), what, "position")))
         case Request.ZERO_DEVICE:
@@ -186,6 +174,32 @@ def _axis_request(
             raise _refuse(errno.ENOTTY, f"{what}: not a request of an axis")
     service.engine.commands_written(handle.block)
     return None
+
+
+def _synch(service: Service, handle: Handle, number: int, argument: Any, timeout_s: float | None, what: str) -> Any:
+    """Start what waits for the synch, after the writes that the handle has sent before it."""
+    if argument is not None and type(argument) is not int:
+        raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as start; want a time in ns, or none for now")
+
+    def start() -> int:
+        now_ns = service.loop.now_ns()
+        start_ns = argument or now_ns
+        if start_ns < now_ns - service.loop.period_ns:
+            late_ms = (now_ns - start_ns) / 1e6
+            raise _refuse(errno.ETIME, f"{what}: its start time passed {late_ms:.2f} ms ago; give it more lead")
+        if start_ns > now_ns + 60_000_000_000:
+            raise _refuse(errno.EINVAL, f"{what}: starts in {(start_ns - now_ns) / 1e9:.0f} s; want at most 60 s")
+        handle.block.bank.synch(handle.channels, start_ns, now_ns)  # type: ignore[union-attr]
+        service.engine.commands_written(handle.block)
+        return start_ns
+
+    behind = Behind(handle, start)
+    if behind.has_turn():
+        return start()
+    deadline_ns = service.loop.deadline(timeout_s)
+    service.waits.add(Wait(handle, number, what, deadline_ns, behind.ready, frozenset(), behind.leave))
+    handle.writing.append(behind)
+    return LATER
 
 
 def _zero_analog(

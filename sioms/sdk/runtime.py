@@ -191,7 +191,8 @@ class Runtime:
 
     def as_of_ns(self) -> int:
         """Return an instant before which all that was asked for has been heeded: now, unless there is something new."""
-        return time.monotonic_ns() if self.stops.is_up_to_date else self.looked_ns
+        now_ns = time.monotonic_ns()  # first: what comes after the look may have come before a later instant
+        return now_ns if self.stops.is_up_to_date else self.looked_ns
 
     def deadline(self, timeout_s: float | None) -> int | None:
         """Return when a time-out that begins now ends [ns]."""

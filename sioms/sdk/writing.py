@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import errno
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -96,16 +96,17 @@ class AxesWrite:
 
     Attributes:
         lacks_room: whether it has been found to need more room than there is.
+        replaces: whether it replaces the buffer.
     """
 
-    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_replace", "_service", "lacks_room")
+    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_service", "lacks_room", "replaces")
 
     def __init__(self, service: Service, handle: Handle, records: NDArray[Any], replace: bool, patient: bool) -> None:
         self.lacks_room = False
         self._service = service
         self._handle = handle
         self._records = records
-        self._replace = replace
+        self.replaces = replace
         self._patient = patient
         self._judgement: Judgement | None = None
 
@@ -131,7 +132,7 @@ class AxesWrite:
             OSError: EAGAIN, one waits for room and this writer does not want to wait.
         """
         writing = self._handle.writing
-        if self._replace or not writing or writing[0] is self:
+        if self.replaces or not writing or writing[0] is self:
             return True
         if writing[0].lacks_room and not self._patient:
             raise self._refusal(errno.EAGAIN, "an earlier write still waits for room")
@@ -148,10 +149,10 @@ class AxesWrite:
         self.lacks_room = False
         try:
             if len(self._records) <= _AT_ONCE:
-                bank.append(self._records, axes, now_ns, replace=self._replace)
+                bank.append(self._records, axes, now_ns, replace=self.replaces)
             else:
                 if self._judgement is None:
-                    self._judgement = bank.judge(self._records, axes, now_ns, replace=self._replace)
+                    self._judgement = bank.judge(self._records, axes, now_ns, replace=self.replaces)
                 judged = _next(self._judgement)
                 if judged is None:
                     return False
@@ -182,6 +183,51 @@ class AxesWrite:
 
     def _refusal(self, errno_: int, text: str) -> OSError:
         return OSError(errno_, f"write {self._handle.node}: {text}")
+
+
+class Behind:
+    """What is to be done after the writes that a handle has sent before it.
+
+    It waits for those that are judged, not for those that wait for room: what makes room may be what it starts.
+
+    Args:
+        handle: of the client.
+        act: does it.
+    """
+
+    __slots__ = ("_act", "_handle", "lacks_room", "replaces")
+
+    def __init__(self, handle: Handle, act: Callable[[], int]) -> None:
+        self.lacks_room = self.replaces = False
+        self._handle, self._act = handle, act
+
+    def has_turn(self) -> bool:
+        """Tell whether no write before it is about to come into the buffers."""
+        lacks_room = False
+        for write in self._handle.writing:
+            if write is self:
+                break
+            lacks_room |= write.lacks_room
+            if not lacks_room or (write.replaces and not write.lacks_room):
+                return False
+        return True
+
+    def ready(self) -> tuple[int] | None:
+        """Do it when it has its turn.
+
+        Raises:
+            OSError: refused.
+        """
+        if not self.has_turn():
+            return None
+        done = self._act()
+        self.leave()
+        return (done,)
+
+    def leave(self) -> None:
+        """Let the later writes of the handle have their turn."""
+        if self in self._handle.writing:
+            self._handle.writing.remove(self)
 
 
 def end_writes(service: Service, writes: Sequence[Writing], text: str) -> None:
