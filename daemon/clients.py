@@ -304,6 +304,7 @@ class Clients:
         self.markers.end_session(session)
         for handle in list(session.handles.values()):
             self.nodes.detach(handle)
+        _cut(session)
         if session.pidfd >= 0:
             self._server.loop.unwatch(session.pidfd)
             os.close(session.pidfd)
@@ -319,6 +320,8 @@ class Clients:
             session.peer = session.peer if session.peer.key else peer
             if not rights.anywhere(session.peer):
                 self.markers.end_session(session)
+            if not rights.on_workcell(session.peer) & Right.ADMINISTER:
+                _cut(session)
         self.markers.take_up_rights()
         self.nodes.take_up_rights()
 
@@ -360,6 +363,13 @@ class Clients:
             return False
         self.answer(wait, refusal(wait.number, errno.ECANCELED, f"{wait.what}: cancelled"))
         return True
+
+
+def _cut(session: Session) -> None:
+    """Tell a session that it may read no journals any more."""
+    if session.leash is not None:
+        session.leash.cut()
+        session.leash = None
 
 
 def _as_of_ns(message: verbs.Message) -> int:

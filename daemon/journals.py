@@ -27,6 +27,22 @@ def for_reading(fd: int) -> int:
     return os.open(f"/proc/self/fd/{fd}", os.O_RDONLY | os.O_CLOEXEC)
 
 
+class Leash:
+    """Tells a client at once that its right to journals has ended: a pipe whose writing end is closed then.
+
+    Attributes:
+        read_fd: what clients get of it.
+    """
+
+    def __init__(self) -> None:
+        self.read_fd, self._write_fd = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+
+    def cut(self) -> None:
+        """Tell it."""
+        os.close(self._write_fd)
+        os.close(self.read_fd)
+
+
 class OwnJournal:
     """The journal of the daemon itself."""
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 from sioms.protocol.flags import Access, Right
 
+from .journals import Leash
 from .loop import Timer
 from .names import Claim, Node
 from .rights import Peer
@@ -95,6 +96,7 @@ class Session:
         waits: unanswered requests by message number.
         greeting: ends it if it says nothing; None once it has.
         greeted: whether it has said hello.
+        leash: of the journals that it reads; None: of none.
     """
 
     sock: socket.socket
@@ -105,6 +107,7 @@ class Session:
     waits: dict[int, Wait] = field(default_factory=dict)
     greeting: Timer | None = None
     greeted: bool = False
+    leash: Leash | None = None
 
     @property
     def user(self) -> str:

@@ -17,7 +17,7 @@ from sioms.protocol.text import printable
 
 from .alarms import Alarm
 from .devices import State
-from .journals import for_reading
+from .journals import Leash, for_reading
 from .names import shows
 from .rights import Peer
 from .sessions import LATER, Refused, Session
@@ -132,7 +132,9 @@ class WorkcellVerbs:
             raise Refused(errno.ENOENT, f"{what}: no such device; there are: {', '.join(self._server.devices)}")
         fd = for_reading(self._server.shared.journal.fd if process is None else process.journal_fd)
         try:
-            self._clients.send(session, reply(number, process.generation if process else 0), [fd])
+            session.leash = session.leash or Leash()
+            fds = [fd, session.leash.read_fd]
+            self._clients.send(session, reply(number, process.generation if process else 0), fds)
         finally:
             os.close(fd)
         return LATER

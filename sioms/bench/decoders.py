@@ -34,13 +34,16 @@ from sioms.drivers.ft300.codec import RecordReceiver
 from sioms.drivers.iio.codec import Element, Layout, ScanReceiver, parse_type
 from sioms.drivers.modbus.regmap_files import RegisterMapError, parse_map
 from sioms.drivers.schunk_ft.codec import parse as parse_schunk
-from sioms.gateway.core import OWN_NUMBERS, Gateway, Principal
+from sioms.gateway.core import OWN_NUMBERS, Gateway
+from sioms.gateway.parts import Principal
 from sioms.lab.arrays import UnreadableError, read_mat, read_npz
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.protocol import link, verbs, wire
 from sioms.protocol.clock import Wall
 from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_FORK_SERVER, DriverVerb, ForkServerVerb
 from sioms.protocol.flags import NodeClass, PageState
+from sioms.protocol.journal import HEADER, JournalReader, JournalWriter, Note, pack_events, take_events
+from sioms.protocol.journal import Event as Noted
 from sioms.protocol.messages import (
     MAX_PACKET,
     ClientVerb,
@@ -107,6 +110,21 @@ def _link(data: bytes) -> None:
     ):  # fmt: skip
         with suppress(link.MalformedFrame):
             decode_body(data)
+
+
+def _events(data: bytes) -> None:
+    """Events of a journal come into its copy with their numbers, or are malformed."""
+    memory = bytearray(HEADER + 4096)
+    writer, reader = JournalWriter(memoryview(memory)), JournalReader(memory)
+    try:
+        _, events = link.take_followed(data)
+        found = [event for event in take_events(events) if len(event.payload) < 1024]
+    except (link.MalformedFrame, MalformedMessage):
+        return
+    for event in found:
+        writer.put(event)
+        (copy,) = reader.read()
+        assert (copy.number, copy.kind, copy.payload) == (event.number, event.kind, event.payload)
 
 
 def _message(data: bytes) -> None:
@@ -256,6 +274,9 @@ class _Far:
     def attach(self, session: object, handle: int, fds: object) -> _Node:
         return _Node(self)
 
+    def follow(self, session: object, fds: object) -> _Journal:
+        return _Journal()
+
     def drop(self, fds: object) -> None: ...
 
     def log(self, level: str, event: str, **words: object) -> None:
@@ -274,10 +295,21 @@ class _Line:
         match message:
             case verbs.Info():
                 self._answers.append((reply(number, ["mod0", 3, False, []]), ()))
+            case verbs.Journal():
+                self._answers.append((reply(number, 0), (0, 0)))
             case verbs.Open():
                 self._answers.append((reply(number, [number, [], [0], -1, [1, 1]]), (0, 0, 0)))
             case _ if number != OWN_NUMBERS:
                 self._answers.append((reply(number), ()))
+
+    def close(self) -> None: ...
+
+
+class _Journal:
+    """A journal of it, which never ends."""
+
+    def read(self, most_bytes: int) -> list[Noted]:
+        return [Noted(Note.CLOSED, 1, 7, b"\x90")]
 
     def close(self) -> None: ...
 
@@ -469,6 +501,7 @@ TARGETS = {
         2,
         True,
     ),
+    "events": Target(_events, [link.followed(b"answer", pack_events([Noted(8, 5, 7, b"\x90")] * 2))], (), 1, True),
     "streams": Target(
         _streams,
         [b"1.0, 2.0, 3.0\n1,2,3\n", bytes.fromhex("ff204ed8fe2efb2e16640038ff2c017daf"), bytes(36)],
@@ -514,6 +547,7 @@ TARGETS = {
                 (link.Up.HELLO, 0, b""),
                 (link.Up.PACKET, 0, verbs.Hello(2, "a").packed(1)),
                 (link.Up.PACKET, 0, verbs.Open("mod0", 3, 0.0, 0.1).packed(2)),
+                (link.Up.PACKET, 0, verbs.Journal("mod0").packed(3)),
                 (link.Up.PACKET, 2, b"write"),
                 (link.Up.CREDIT, 2, b""),
                 (link.Up.PING, 0, link.ping(1)),

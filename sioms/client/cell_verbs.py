@@ -314,19 +314,23 @@ class WorkcellVerbs(Generic[M]):
         return value
 
     @verb
-    async def journal(self, device: str = "") -> int:
+    async def journal(self, device: str = "") -> tuple[int, int]:
         """Open the journal of a device's driver, '' = of the daemon, for ``JournalReader``.
 
         Returns:
-            A descriptor to be mapped for reading, and closed by the caller.
+            Two descriptors, to be closed by the caller: one to be mapped for reading, and one that becomes readable
+            when the right to it has ended, or the session. On another machine the former is a copy, which goes on until
+            then.
 
         Raises:
             OSError: EPERM, without the right to administer every node; ENOENT, no such device; EMFILE.
         """
         answer = await self._waiter.call(Call(f"open the journal of {device or 'the daemon'}", verbs.Journal(device)))
-        if not answer.fds:  # the kernel drops what goes beyond the limit of open descriptors
+        if len(answer.fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
+            for fd in answer.fds:
+                os.close(fd)
             raise OSError(errno.EMFILE, f"open the journal of {device or 'the daemon'}: too many open descriptors")
-        return answer.fds[0]
+        return answer.fds[0], answer.fds[1]
 
     @verb
     async def report(self, level: str, text: str) -> None:

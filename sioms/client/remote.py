@@ -25,8 +25,9 @@ from typing import Any, Protocol
 from sioms.protocol import link
 from sioms.protocol.clock import Clock, Offset, Wall
 from sioms.protocol.flags import PageState
+from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, take_events
 from sioms.protocol.link import Down, MalformedFrame, PageShape, Up, Update
-from sioms.protocol.messages import MAX_PACKET, ClientVerb, refusal
+from sioms.protocol.messages import MAX_PACKET, ClientVerb, MalformedMessage, refusal
 from sioms.protocol.page import REASON_SIZE, PageCopy, page_size
 from sioms.protocol.text import printable
 
@@ -175,6 +176,40 @@ class _Far:
         self._map.close()
 
 
+class _FarJournal:
+    """A journal at the other end: a copy here, which the program maps."""
+
+    def __init__(self) -> None:
+        self._fd = os.memfd_create("sioms-journal", os.MFD_CLOEXEC)
+        os.ftruncate(self._fd, HEADER + JOURNAL_SIZE)
+        self._map = mmap(self._fd, HEADER + JOURNAL_SIZE)
+        self._writer = JournalWriter(memoryview(self._map))
+        self._leash_read, self._leash = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
+
+    def put(self, events: bytes) -> None:
+        """Add events; raises MalformedFrame."""
+        try:
+            for event in take_events(events):
+                self._writer.put(event)
+        except MalformedMessage as error:
+            raise MalformedFrame(str(error)) from None
+
+    def hand_over(self, session: socket.socket, answer: bytes) -> None:
+        """Pass it along with the answer to its request."""
+        fd = os.open(f"/proc/self/fd/{self._fd}", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            socket.send_fds(session, [answer], [fd, self._leash_read])
+        finally:
+            os.close(fd)
+
+    def close(self) -> None:
+        """Let go of it; the program reads to the end what it has."""
+        for fd in (self._leash, self._leash_read, self._fd):
+            os.close(fd)
+        self._writer.release()
+        self._map.close()
+
+
 class _Bridge:
     """What the thread does."""
 
@@ -187,6 +222,7 @@ class _Bridge:
         self._told_ns = 0
         self._heard_ns = self._pinged_ns = 0
         self._nodes: dict[int, _Far] = {}
+        self._journals: dict[int, _FarJournal] = {}
         self._by_fd: dict[int, int] = {}
         self._stop: tuple[float, bytes] | None = None
         self._last_word: tuple[int, str] | None = None
@@ -353,10 +389,25 @@ class _Bridge:
                 far.answer = packet
                 self._by_fd[far.ours.fileno()] = channel
                 self._epoll.register(far.ours.fileno(), select.EPOLLIN)
+            case Down.FOLLOWED:
+                packet, events = link.take_followed(body)
+                journal = self._journals[channel] = _FarJournal()
+                journal.put(events)
+                journal.hand_over(self.ours, packet)
+            case Down.EVENTS if channel in self._journals:
+                self._send(Up.CREDIT, channel)
+                self._journals[channel].put(body)
+            case Down.UNFOLLOWED:
+                self._drop_journals()
             case Down.PONG:
                 self._compare(stamp_ns, body)
             case Down.END:
                 self._last_word = (channel or errno.EIO, printable(body.decode("utf-8", "replace"), 1024))
+
+    def _drop_journals(self) -> None:
+        for journal in self._journals.values():
+            journal.close()
+        self._journals.clear()
 
     def _end_of(self, far: _Far, handle: int) -> None:
         """Let the program find a node's connection ended; its page goes on telling how the device is."""
@@ -409,6 +460,7 @@ class _Bridge:
         for far in self._nodes.values():
             far.close()
         self._nodes.clear()
+        self._drop_journals()
         self.ours.close()
         self._link.close()
         self._epoll.close()

@@ -12,13 +12,14 @@ from __future__ import annotations
 import errno
 import traceback
 from collections.abc import Callable, Collection, Sequence
-from dataclasses import dataclass, field
-from typing import Protocol
 
 from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
-from sioms.protocol.link import Down, MalformedFrame, PageShape, Up, Update
+from sioms.protocol.journal import JOURNAL_SIZE, pack_events
+from sioms.protocol.link import Down, MalformedFrame, Up, Update
 from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, reply, value_of
+
+from .parts import Followed, Held, Outside, Principal, Session
 
 OWN_NUMBERS = 1 << 52
 """Message numbers from here on are the gateway's own requests."""
@@ -37,149 +38,10 @@ URGENT_NS = 30_000_000
 """How long after an answer snapshots are sent as they come: one of them shows what was acknowledged."""
 LOOK_NS = 500_000
 """How often to look for them."""
-
-
-@dataclass(frozen=True, slots=True)
-class Principal:
-    """Who holds a key.
-
-    Attributes:
-        name: of the key.
-        groups: of the key.
-        public: the key itself.
-    """
-
-    name: str
-    groups: tuple[str, ...] = ()
-    public: str = ""
-
-
-class Page(Protocol):
-    """What is read of a page; see ``protocol.page.PageReader``."""
-
-    @property
-    def head(self) -> int:
-        """Number of the newest snapshot."""
-
-    def numbered(self, number: int) -> bytes | None:
-        """Copy a snapshot by its number."""
-
-    def condition(self) -> tuple[int, int, int, bytes]:
-        """Return what readers judge the page by."""
-
-
-class Node(Protocol):
-    """A node that has been opened at the daemon."""
-
-    shape: PageShape
-
-    @property
-    def page(self) -> Page:
-        """What is read of it."""
-
-    def send(self, packet: bytes) -> None:
-        """Send a packet to the driver; raises OSError."""
-
-    def end(self) -> None:
-        """Close the connection to the driver: what was owned is halted. The page stays."""
-
-    def close(self) -> None:
-        """Let go of everything."""
-
-
-class Line(Protocol):
-    """A connection to the daemon."""
-
-    def send(self, packet: bytes) -> None:
-        """Send a packet; raises OSError."""
-
-    def close(self) -> None:
-        """Close it: what its session has open is closed."""
-
-
-class Outside(Protocol):
-    """Sockets, around the core."""
-
-    def send(self, peer: bytes, frame: bytes) -> bool:
-        """Send a frame to a client; False when it has gone, or takes no more."""
-
-    def connect(self, session: Session) -> Line:
-        """Connect to the daemon; raises OSError."""
-
-    def attach(self, session: Session, handle: int, fds: Sequence[int]) -> Node:
-        """Take the descriptors of an open."""
-
-    def drop(self, fds: Sequence[int]) -> None:
-        """Close descriptors that nobody wants."""
-
-    def log(self, level: str, event: str, **words: object) -> None:
-        """Write a line."""
-
-
-@dataclass(slots=True, eq=False)
-class Held:
-    """A node that a remote client has open.
-
-    Attributes:
-        handle: number of the handle.
-        name: of the node.
-        node: at the daemon.
-        lease_ns: longest age of the client's word, 0 = any: it owns nothing.
-        until_ns: when the lease runs out.
-        cursor: number of the newest snapshot that has been sent.
-        ahead: frames of snapshots that are not confirmed.
-        sent_ns: when the last one was sent.
-        woken: whether the driver has woken us for it since.
-        ended: whether its connection has ended.
-    """
-
-    handle: int
-    name: str
-    node: Node
-    lease_ns: int
-    until_ns: int
-    cursor: int = 0
-    ahead: int = 0
-    sent_ns: int = 0
-    state: tuple[int, int] = (-1, -1)
-    woken: bool = False
-    ended: bool = False
-
-
-@dataclass(slots=True, eq=False)
-class Session:
-    """A connected client.
-
-    Attributes:
-        peer: address of it for the transport.
-        who: whose key it has; host: where it is.
-        heard: number of its last frame.
-        heard_ns: when that came; sent_ns: when something was last sent to it.
-        urgent_ns: until when its snapshots are sent as they come.
-        line: to the daemon; None before the first packet.
-        taken_in: whether the daemon has taken it for the key's.
-        waiting: packets from before that.
-        opens: what waits for an answer: leases by message number of the open.
-        asked: opens that wait for what their node is, by number of the gateway's own request.
-        held: open nodes by handle.
-    """
-
-    peer: bytes
-    who: Principal
-    host: str
-    heard_ns: int
-    heard: int = 1
-    sent_ns: int = 0
-    urgent_ns: int = 0
-    line: Line | None = None
-    taken_in: bool = False
-    waiting: list[bytes] = field(default_factory=list)
-    opens: dict[int, tuple[str, float]] = field(default_factory=dict)
-    asked: dict[int, tuple[int, verbs.Open]] = field(default_factory=dict)
-    held: dict[int, Held] = field(default_factory=dict)
-
-    def __str__(self) -> str:
-        return f"{self.who.name}@{self.host}"
+JOURNAL_NS = 20_000_000
+"""How often events of journals are sent."""
+JOURNAL_BYTES = 48 << 10
+"""Bytes of events in one frame, but for the last one; more come with the next."""
 
 
 class Gateway:
@@ -271,6 +133,10 @@ class Gateway:
                 self._to_driver(session, channel, stamp_ns, body, now_ns)
             case Up.PACKET:
                 self._to_daemon(session, body)
+            case Up.CREDIT if channel & link.JOURNAL:
+                for followed in session.followed.values():
+                    if followed.channel == channel:
+                        followed.ahead = max(0, followed.ahead - 1)
             case Up.CREDIT:
                 if held := session.held.get(channel):
                     held.ahead = max(0, held.ahead - 1)
@@ -321,9 +187,7 @@ class Gateway:
 
     def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes) -> None:
         if isinstance(message, verbs.Journal):
-            text = "read a journal: it is a file of the workcell's machine; read it there"
-            self._send(session, Down.PACKET, body=refusal(number, errno.EPERM, text))
-            return
+            session.asks[number] = message.device
         if isinstance(message, verbs.Cancel) and self._cancelled(session, number, message.number):
             return
         if isinstance(message, verbs.Open):
@@ -395,10 +259,39 @@ class Gateway:
         if asked is not None and not errno_ and len(fds) == 3:
             self._opened(session, asked, value_of(message)[0], packet, fds, now_ns)
             return
+        device = session.asks.pop(number, None)
+        if device is not None and not errno_ and len(fds) == 2:
+            self._follow(session, number, device, packet, fds)
+            return
         self._outside.drop(fds)
         session.urgent_ns = now_ns + URGENT_NS
         self.due_ns = min(self.due_ns, now_ns + LOOK_NS)
         self._send(session, Down.PACKET, body=packet)
+
+    def _follow(self, session: Session, number: int, device: str, packet: bytes, fds: Sequence[int]) -> None:
+        """Begin to send a journal: what it keeps goes with the answer."""
+        try:
+            journal = self._outside.follow(session, fds)
+        except OSError as error:
+            self._send(session, Down.PACKET, body=refusal(number, error.errno or errno.EIO, str(error.strerror)))
+            return
+        if before := session.followed.pop(device, None):
+            before.journal.close()
+        channel = link.JOURNAL | number
+        session.followed[device] = Followed(channel, journal)
+        kept = pack_events(journal.read(JOURNAL_SIZE))
+        self._send(session, Down.FOLLOWED, channel, link.followed(packet, kept))
+
+    def unfollow(self, session: Session) -> None:
+        """The right of a session to journals has ended."""
+        for followed in session.followed.values():
+            followed.journal.close()
+        session.followed.clear()
+        if session.peer in self.sessions:
+            self._outside.log(
+                "warning", "journals ended", peer=str(session), why="the right to them has ended, or the daemon"
+            )
+            self._send(session, Down.UNFOLLOWED)
 
     def _taken_in(self, session: Session, errno_: int, text: str) -> None:
         if errno_:
@@ -466,6 +359,9 @@ class Gateway:
                     else:
                         due_ns = min(due_ns, held.until_ns + 1)
                 due_ns = min(due_ns, self._feed(session, held, now_ns))
+            if session.followed:
+                due_ns = min(due_ns, now_ns + JOURNAL_NS)
+                self._feed_journals(session)
             beacon_ns = session.sent_ns + int((link.BEACON_S if owns else link.PING_S) * 1e9)
             if beacon_ns <= now_ns and session.peer in self.sessions:
                 self._send(session, Down.BEACON)
@@ -507,6 +403,13 @@ class Gateway:
             self._send(session, Down.UPDATE, held.handle, update.packed())
         return now_ns + (LOOK_NS if urgent else IDLE_NS)
 
+    def _feed_journals(self, session: Session) -> None:
+        """Send what has been noted since, to a client that keeps up."""
+        for followed in list(session.followed.values()):
+            if followed.ahead < link.WINDOW and (events := followed.journal.read(JOURNAL_BYTES)):
+                followed.ahead += 1
+                self._send(session, Down.EVENTS, followed.channel, pack_events(events))
+
     # --- ends ------------------------------------------------------------------------------------
 
     def allow(self, keys: Collection[Principal]) -> None:
@@ -531,6 +434,9 @@ class Gateway:
             for held in session.held.values():
                 held.node.close()
             session.held.clear()
+            for followed in session.followed.values():
+                followed.journal.close()
+            session.followed.clear()
             if session.line is not None:
                 session.line.close()
 

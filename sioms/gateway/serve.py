@@ -21,8 +21,9 @@ from sioms.notify import ServiceManager
 from sioms.protocol.clock import Wall
 from sioms.protocol.text import printable
 
-from .core import Gateway, Line, Node, Principal, Session
-from .sockets import DaemonLine, OpenNode
+from .core import Gateway
+from .parts import Journal, Line, Node, Principal, Session
+from .sockets import DaemonLine, FollowedJournal, OpenNode
 
 KEYS_S = 0.1
 """How often the list of keys, and what piles up, are looked at [s]."""
@@ -155,6 +156,10 @@ class Serve:
                 self.gateway.driver_gone(session, handle)
 
         return OpenNode(fds, self, packet, partial(self.gateway.woken, session, handle))
+
+    def follow(self, session: Session, fds: Sequence[int]) -> Journal:
+        """Take the descriptors of a journal."""
+        return FollowedJournal(fds, self, partial(self.gateway.unfollow, session))
 
     def drop(self, fds: Sequence[int]) -> None:
         """Close descriptors that nobody wants."""

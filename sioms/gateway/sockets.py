@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 from collections import deque
@@ -10,8 +11,9 @@ from mmap import PROT_READ, mmap
 from typing import TYPE_CHECKING, Protocol
 
 from sioms.client.channel import connect
+from sioms.protocol.journal import Event, JournalReader
 from sioms.protocol.link import PageShape
-from sioms.protocol.messages import MAX_PACKET, MAX_WRITE
+from sioms.protocol.messages import MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.page import PageReader
 
 if TYPE_CHECKING:
@@ -168,4 +170,43 @@ class OpenNode:
             os.close(self._wake_fd)
             self._wake_fd = -1
             self.page.release()
+            self._map.close()
+
+
+class FollowedJournal:
+    """A journal that the daemon has opened for a session; see ``core.Journal``.
+
+    Args:
+        fds: of its memory, and of what ends when the right to it does; owned from now on.
+        watch: the loop.
+        over: called when the right has ended.
+
+    Raises:
+        OSError: it cannot be mapped, or is none that this version reads.
+    """
+
+    def __init__(self, fds: Sequence[int], watch: Watch, over: Callable[[], None]) -> None:
+        fd, self._leash = fds
+        self._watch, self._over = watch, over
+        try:
+            self._map = mmap(fd, os.fstat(fd).st_size, prot=PROT_READ)
+            self._reader = JournalReader(self._map)
+        except (OSError, ValueError, MalformedMessage) as error:
+            os.close(self._leash)
+            raise OSError(errno.EIO, f"read a journal: {error}") from None
+        finally:
+            os.close(fd)
+        watch.add(self._leash, over)
+
+    def read(self, most_bytes: int) -> list[Event]:
+        """Return events since the last look, oldest first; none if the right has ended meanwhile."""
+        return [] if self._leash < 0 else self._reader.read(most_bytes)
+
+    def close(self) -> None:
+        """Let go of it."""
+        if self._leash >= 0:
+            self._watch.remove(self._leash)
+            os.close(self._leash)
+            self._leash = -1
+            self._reader.release()
             self._map.close()

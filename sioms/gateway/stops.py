@@ -18,8 +18,8 @@ from zmq.utils import z85
 from sioms.protocol.link import MalformedFrame
 from sioms.protocol.messages import MalformedMessage
 
-from .core import Principal
 from .inflow import Inflow
+from .parts import Principal
 from .ways import Ways
 
 DOMAIN = b"sioms"

@@ -18,7 +18,7 @@ from sioms.protocol.messages import refusal, reply
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.text import printable
 
-from .core import Principal
+from .parts import Principal
 
 MOST_WAYS = 64
 """Sessions at the daemon that are kept for the next stop; the oldest gives way."""

@@ -32,6 +32,7 @@ from .page import fence
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from typing import Any
 
 MAGIC = b"SIOMSjn1"
@@ -132,10 +133,14 @@ class JournalWriter:
             payload = encode(*[value if isinstance(value, int) else str(value)[:200] for value in values[:8]])
         self.append(kind, payload, stamp_ns)
 
-    def append(self, kind: int, payload: bytes, stamp_ns: int) -> None:
-        """Append an event whose payload is packed, of at most MOST bytes."""
+    def put(self, event: Event) -> None:
+        """Append an event of another journal, of which this one is a copy, with its number."""
+        self.append(event.kind, event.payload, event.stamp_ns, event.number)
+
+    def append(self, kind: int, payload: bytes, stamp_ns: int, number: int = 0) -> None:
+        """Append an event whose payload is packed, of at most MOST bytes; ``number`` 0: the next one."""
         words, size = self._words, self._size
-        number, head = words[_NUMBER] + 1, words[_HEAD]
+        number, head = number or words[_NUMBER] + 1, words[_HEAD]
         event = _EVENT.pack(len(payload), kind, number, stamp_ns) + payload
         event += bytes(-len(event) % 8)
         end = head + len(event)
@@ -186,8 +191,8 @@ class JournalReader:
         self._at = self._words[_TAIL] if from_start else self._words[_HEAD]
         self._last = 0
 
-    def read(self) -> list[Event]:
-        """Return the events since the last look, oldest first."""
+    def read(self, most_bytes: int = JOURNAL_SIZE) -> list[Event]:
+        """Return the events since the last look, oldest first; those beyond so many bytes with the next look."""
         words = self._words
         head = words[_HEAD]
         if head == self._at:
@@ -196,14 +201,15 @@ class JournalReader:
         data = self._copy(begin, head)
         good = words[_TAIL]  # what lies before it may have been overwritten while it was copied
         events, at = [], max(begin, good)
-        while at < head:
+        while at < head and at - begin < most_bytes:
             length, kind, number, stamp_ns = _EVENT.unpack_from(data, at - begin)
             place = at - begin + _EVENT.size
             events.append(Event(kind, number, stamp_ns, data[place : place + length]))
             at += _EVENT.size + -(-length // 8) * 8
         self._at = at
         if events:
-            self.lost += events[0].number - self._last - 1 if self._last else 0
+            last = self._last or events[0].number - 1
+            self.lost += events[-1].number - last - len(events)
             self._last = events[-1].number
         return events
 
@@ -218,3 +224,29 @@ class JournalReader:
     def release(self) -> None:
         """Drop the view, so that the mapping can be closed."""
         self._words.release()
+
+
+def pack_events(events: Sequence[Event]) -> bytes:
+    """Return events as one piece of bytes."""
+    return b"".join(
+        _EVENT.pack(len(event.payload), event.kind, event.number, event.stamp_ns) + event.payload for event in events
+    )
+
+
+def take_events(data: bytes) -> list[Event]:
+    """Take such a piece apart.
+
+    Raises:
+        MalformedMessage: it is none.
+    """
+    events, at = [], 0
+    while at < len(data):
+        if len(data) - at < _EVENT.size:
+            raise MalformedMessage(f"{len(data) - at} bytes behind the last event")
+        length, kind, number, stamp_ns = _EVENT.unpack_from(data, at)
+        at += _EVENT.size
+        if length > min(MOST, len(data) - at) or not number:
+            raise MalformedMessage(f"event {number} of {length} bytes")
+        events.append(Event(kind, number, stamp_ns, data[at : at + length]))
+        at += length
+    return events

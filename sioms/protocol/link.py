@@ -41,6 +41,8 @@ PING_S = 0.25
 """A client asks for the time so often [s]."""
 GONE_S = 3.0
 """A link on which nothing has come for so long is lost [s]."""
+JOURNAL = 1 << 62
+"""Channels of journals: this, and the number of the request."""
 _PAGE = Struct("<IIIIQQQ")
 _UPDATE = Struct("<QIIIHH")
 _PING = Struct("<q")
@@ -76,6 +78,12 @@ class Down(IntEnum):
     PONG = 21
     END = 22
     """The session has ended; ``channel`` is an errno and the body a sentence."""
+    FOLLOWED = 23
+    """The answer to a journal that was granted, and the events that it keeps; see ``followed``."""
+    EVENTS = 24
+    """Events of a journal, in order; what is missing in their numbers was overwritten before it could be sent."""
+    UNFOLLOWED = 25
+    """The right to journals has ended, and with it all that follow them in this session."""
 
 
 class MalformedFrame(Exception):
@@ -142,6 +150,19 @@ def take_opened(body: bytes) -> tuple[PageShape, bytes]:
     if slots * shape.slot_size > 1 << 30:
         raise MalformedFrame(f"a page of {slots * shape.slot_size} bytes")
     return shape, body[_PAGE.size :]
+
+
+def followed(packet: bytes, events: bytes) -> bytes:
+    """Return the body of FOLLOWED."""
+    return len(packet).to_bytes(4, "little") + packet + events
+
+
+def take_followed(body: bytes) -> tuple[bytes, bytes]:
+    """Take the body of FOLLOWED apart into a packet and events; raises MalformedFrame."""
+    size = int.from_bytes(body[:4], "little")
+    if len(body) < 4 + size:
+        raise MalformedFrame(f"a packet of {size} bytes in {len(body)}")
+    return body[4 : 4 + size], body[4 + size :]
 
 
 class Update:

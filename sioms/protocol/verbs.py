@@ -264,7 +264,8 @@ class Journal(Message, on=FROM_CLIENT, verb=ClientVerb.JOURNAL, query=True):
     """Open the journal of a device's driver processes, '' = of the daemon; takes the right to administer
     every node, because commands name the keys of markers.
 
-    Answer: number of the driver's generation, 0 for the daemon; descriptor: the journal, to be read only.
+    Answer: number of the driver's generation, 0 for the daemon; descriptors: the journal, to be read only, and a
+    pipe that ends when the right to it does.
     """
 
     device: Name

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from sioms.protocol.journal import HEADER, MOST, JournalReader, JournalWriter, Note
+from sioms.protocol.journal import HEADER, MOST, Event, JournalReader, JournalWriter, Note, pack_events, take_events
 from sioms.protocol.messages import MalformedMessage
 
 
@@ -58,3 +58,30 @@ def test_what_is_too_long_is_shortened() -> None:
 def test_other_memory_is_refused() -> None:
     with pytest.raises(MalformedMessage, match="SIOMSjn1"):
         JournalReader(bytes(HEADER + 64))
+
+
+def test_a_copy_has_the_numbers_of_its_original_and_tells_what_is_missing() -> None:
+    memory = bytearray(HEADER + 4096)
+    writer, reader = JournalWriter(memoryview(memory)), JournalReader(memory)
+    sent = [Event(Note.LOG, number, 5 + number, b"\x90") for number in (7, 8, 11, 12)]
+    for event in take_events(pack_events(sent)):
+        writer.put(event)
+    assert [(event.number, event.stamp_ns) for event in reader.read()] == [(7, 12), (8, 13), (11, 16), (12, 17)]
+    assert reader.lost == 2, "what is missing between the first and the last"
+    writer.put(Event(Note.LOG, 20, 5, b"\x90"))
+    assert len(reader.read()) == 1 and reader.lost == 9
+
+
+def test_a_reader_may_take_a_part_only() -> None:
+    memory = bytearray(HEADER + 4096)
+    writer, reader = JournalWriter(memoryview(memory)), JournalReader(memory)
+    for _ in range(10):
+        writer.note(Note.CLOSED, 7, "mod0", "eva")
+    assert [event.number for event in reader.read(100)] == [1, 2, 3]
+    assert [event.number for event in reader.read()] == [4, 5, 6, 7, 8, 9, 10] and reader.lost == 0
+
+
+@pytest.mark.parametrize("data", [b"x", pack_events([Event(1, 1, 1, b"abc")])[:-1], pack_events([Event(1, 0, 1, b"")])])
+def test_bytes_that_are_no_events_are_refused(data: bytes) -> None:
+    with pytest.raises(MalformedMessage):
+        take_events(data)

@@ -65,7 +65,7 @@ class Recorder:
         self._sequence = 0
         self._retry_s = 0.0
         self._poll = poll()
-        self._may_hear = True
+        self._may_hear, self._over = True, False
         self._gone: list[Workcell] = []
         self.cell: Workcell | None = connect()
         self._time = CellTime(self.cell.clock)
@@ -124,7 +124,8 @@ class Recorder:
         try:
             for device in ["", *[each["name"] for each in cell.status()["devices"]]] if self._may_hear else []:
                 if device not in self._journals:
-                    self._journals[device] = JournalTap(cell.journal(device), device or "daemon", from_start=self._past)
+                    fds = cell.journal(device)
+                    self._journals[device] = JournalTap(*fds, device or "daemon", from_start=self._past)
         except OSError as error:
             if error.errno not in (errno.EPERM, errno.EROFS):
                 raise
@@ -198,6 +199,7 @@ class Recorder:
             for tap, _ in self._taps.values():
                 tap.renew = True
             self._tell("daemon gone", text="the daemon has ended; drivers stop by themselves")
+        self._look_at_rights()
         changed = any(
             event.source == "daemon" and event.kind == "log" and event.text == "device up" for event in events
         )
@@ -214,10 +216,22 @@ class Recorder:
                 self._tell("daemon back", text=f"connected to the daemon of {self.cell.name} again")
                 for journal in self._journals.values():
                     journal.release()
-                self._journals = {}
+                self._journals, self._may_hear = {}, True
         if self.cell is not None:
             with suppress(OSError):
                 self._attach(self.cell)
+
+    def _look_at_rights(self) -> None:
+        """Let go of journals when the right to them has ended; at the end of a session they are read to their end."""
+        over = self.cell is not None and any(journal.is_over for journal in self._journals.values())
+        if over and self._over:  # seen twice: the end of a session would have been seen by now
+            for journal in self._journals.values():
+                journal.release()
+            self._journals, self._may_hear = {}, False
+            text = "commands, stops and faults are not recorded any more: the right to administer every node has ended"
+            self._tell("lost", text=text)
+            self._log(text)
+        self._over = over
 
     def run(self, until: Callable[[], bool]) -> None:
         """Record until told to end.

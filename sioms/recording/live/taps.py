@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import mmap
 import os
+from select import POLLIN, poll
 from typing import Any
 
 import numpy as np
@@ -148,12 +149,15 @@ class JournalTap:
 
     Args:
         fd: of the journal; it is closed.
+        leash: descriptor that becomes readable when the right to it ends; it is closed with the tap.
         source: whose it is, as events tell it.
         from_start: whether it begins with the oldest event that is kept.
     """
 
-    def __init__(self, fd: int, source: str, *, from_start: bool = False) -> None:
+    def __init__(self, fd: int, leash: int, source: str, *, from_start: bool = False) -> None:
         self.source = source
+        self._leash, self._poll = leash, poll()
+        self._poll.register(leash, POLLIN)
         try:
             self._map = mmap.mmap(fd, os.fstat(fd).st_size, prot=mmap.PROT_READ)
         finally:
@@ -167,8 +171,14 @@ class JournalTap:
         lost, self._lost = self._reader.lost - self._lost, self._reader.lost
         return events, lost
 
+    @property
+    def is_over(self) -> bool:
+        """Whether the right to it has ended, or the session."""
+        return bool(self._poll.poll(0))
+
     def release(self) -> None:
         """Let go of the memory."""
+        os.close(self._leash)
         self._reader.release()
         self._map.close()
 

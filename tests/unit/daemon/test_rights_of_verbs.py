@@ -339,6 +339,23 @@ def test_who_loses_the_last_right_loses_markers_and_waits_for_them(cell: Workcel
     assert cell.answer("eva") == errno.EPIPE, "the marker that it waits for went with its owner's rights"
 
 
+def test_who_may_read_journals_no_more_is_told_at_once(cell: Workcell) -> None:
+    cell.grant((["administer"], "eva", "*"), (["administer"], "tom", "*"))
+    assert cell.ask("eva", ClientVerb.JOURNAL, "") == 0 and cell.ask("eva", ClientVerb.JOURNAL, "") == 0
+    leash = cell.sessions["eva"].leash
+    assert leash is not None
+    mine = os.dup(leash.read_fd)
+    try:
+        cell.grant((["administer"], "eva", "*"))
+        with pytest.raises(BlockingIOError):
+            os.read(mine, 1)
+        cell.grant((["administer"], "eva", "io0*"))
+        assert os.read(mine, 1) == b"" and cell.sessions["eva"].leash is None
+        assert cell.ask("eva", ClientVerb.JOURNAL, "") == errno.EPERM
+    finally:
+        os.close(mine)
+
+
 def test_a_reload_that_waits_is_refused_when_the_one_before_took_the_right(cell: Workcell) -> None:
     cell.grant((["administer"], "eva", "*"))
     assert cell.ask("eva", ClientVerb.RELOAD) is None

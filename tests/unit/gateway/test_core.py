@@ -9,10 +9,12 @@ from typing import Any
 
 import pytest
 
-from sioms.gateway.core import MOST_OF_A_KEY, MOST_SESSIONS, OWN_NUMBERS, Gateway, Principal, Session
+from sioms.gateway.core import JOURNAL_BYTES, MOST_OF_A_KEY, MOST_SESSIONS, OWN_NUMBERS, Gateway
+from sioms.gateway.parts import Principal, Session
 from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
 from sioms.protocol.flags import NodeClass, PageState
+from sioms.protocol.journal import HEADER, Event, JournalReader, JournalWriter, Note, take_events
 from sioms.protocol.link import Down, PageShape, Up, Update
 from sioms.protocol.messages import decode, decode_reply, refusal, reply
 from sioms.protocol.page import PageReader, PageWriter, page_size
@@ -50,6 +52,22 @@ class Node:
             self.page.release()
 
 
+class Journal:
+    """A journal in memory."""
+
+    def __init__(self) -> None:
+        memory = bytearray(HEADER + 8192)
+        self.writer, self._reader = JournalWriter(memoryview(memory)), JournalReader(memory)
+        self.closed = False
+
+    def read(self, most_bytes: int) -> list[Event]:
+        assert not self.closed
+        return self._reader.read(most_bytes)
+
+    def close(self) -> None:
+        self.closed = True
+
+
 class Line:
     """A connection to a daemon that is written down."""
 
@@ -73,6 +91,7 @@ class World:
         self.nodes: dict[int, Node] = {}
         self.lines: list[Line] = []
         self.dropped: list[int] = []
+        self.journals: list[Journal] = []
         self.takes = True
         self.numbers: dict[bytes, int] = {}
         self.gateway = Gateway(self, lambda: self.now_ns, lambda: Wall(5, 7, 1))
@@ -88,6 +107,9 @@ class World:
     def attach(self, session: Session, handle: int, fds: Sequence[int]) -> Node:
         self.nodes[handle] = Node()
         return self.nodes[handle]
+
+    def follow(self, session: Session, fds: Sequence[int]) -> Journal:
+        return self.journals[-1]
 
     def drop(self, fds: Sequence[int]) -> None:
         self.dropped += fds
@@ -172,12 +194,6 @@ def test_a_client_says_nothing_in_the_gateways_name(world: World) -> None:
     world.begin(b"b")
     world.ask(b"b", OWN_NUMBERS + 5, verbs.List())
     assert b"b" not in world.gateway.sessions
-
-
-def test_what_comes_as_a_descriptor_is_refused_with_a_sentence(world: World) -> None:
-    line = world.begin(b"a")
-    world.ask(b"a", 4, verbs.Journal(""))
-    assert decode_reply(world.last(b"a", Down.PACKET)[1])[1:3] == [4, errno.EPERM] and len(line.got) == 2
 
 
 @pytest.mark.parametrize(("asked_s", "gets_s"), [(0.0, link.DEFAULT_LEASE_S), (2.0, 2.0)])
@@ -456,3 +472,101 @@ def test_hostile_frames_end_their_own_session_and_open_nothing(world: World) -> 
         world.numbers[b"x"] = session.heard if session else 0
         assert not session or not session.held
     assert node.state == "open" and not node.got
+
+
+def follow(world: World, peer: bytes, number: int = 7) -> Journal:
+    """Have the daemon grant a journal, which keeps three events."""
+    journal = Journal()
+    world.journals.append(journal)
+    for _ in range(3):
+        journal.writer.note(Note.CLOSED, world.now_ns, "mod0", "eva")
+    world.ask(peer, number, verbs.Journal("mod0"))
+    world.gateway.daemon_packet(world.session(peer), reply(number, 1), (11, 12))
+    return journal
+
+
+def events(world: World, peer: bytes, since: int) -> list[int]:
+    """Return the numbers of the events that a client was sent."""
+    frames = [body for kind, *_, body in world.sent[peer][since:] if kind == Down.EVENTS]
+    return [event.number for body in frames for event in take_events(body)]
+
+
+def test_a_journal_is_asked_of_the_daemon_and_sent_with_what_it_keeps(world: World) -> None:
+    line = world.begin(b"a")
+    journal = follow(world, b"a")
+    assert line.got[-1] == verbs.Journal("mod0").packed(7), "the daemon judges the key's right"
+    (kind, channel, _, _, body) = world.sent[b"a"][-1]
+    packet, kept = link.take_followed(body)
+    assert (kind, channel, packet) == (Down.FOLLOWED, link.JOURNAL | 7, reply(7, 1))
+    assert [event.number for event in take_events(kept)] == [1, 2, 3] and world.dropped == []
+    since = len(world.sent[b"a"])
+    journal.writer.note(Note.STOP, world.now_ns, "EMERGENCY", "a test", [])
+    world.gateway.tick()
+    assert events(world, b"a", since) == [4]
+    world.frame(b"a", Up.BYE)
+    assert journal.closed
+
+
+def test_a_refused_journal_is_an_answer(world: World) -> None:
+    world.begin(b"a")
+    world.ask(b"a", 7, verbs.Journal("mod0"))
+    world.gateway.daemon_packet(world.session(b"a"), refusal(7, errno.EPERM, "no right"))
+    assert decode_reply(world.sent[b"a"][-1][4])[2] == errno.EPERM and not world.session(b"a").followed
+
+
+def test_who_does_not_confirm_events_gets_four_frames_and_hears_of_what_was_overwritten(world: World) -> None:
+    world.begin(b"a")
+    world.begin(b"b")
+    journal = follow(world, b"a")
+    since = len(world.sent[b"a"])
+    for _ in range(300):
+        world.now_ns += MS
+        journal.writer.note(Note.CLOSED, world.now_ns, "n" * 100, "eva")
+        world.frame(b"a", Up.PING, body=link.ping(1))
+        world.gateway.tick()
+    assert events(world, b"a", since) == [4, 5, 6, 7], "of who does not confirm nothing more is read"
+    for _ in range(4):
+        world.frame(b"a", Up.CREDIT, link.JOURNAL | 7)
+    world.gateway.tick()
+    got = events(world, b"a", since)
+    assert got[4] > 8 and got[4:] == list(range(got[4], 304)), "the newest, whose numbers tell what is missing"
+    copy = bytearray(HEADER + (1 << 16))
+    writer, reader = JournalWriter(memoryview(copy)), JournalReader(copy)
+    for number in [1, 2, 3, *got]:
+        writer.put(Event(Note.CLOSED, number, 7, b"\x90"))
+    reader.read()
+    assert reader.lost == got[4] - 8
+    assert events(world, b"b", 0) == []
+
+
+def test_events_come_in_frames_of_bounded_size(world: World) -> None:
+    world.begin(b"a")
+    journal = follow(world, b"a")
+    memory = bytearray(HEADER + (1 << 19))
+    journal.writer, journal._reader = JournalWriter(memoryview(memory)), JournalReader(memory)
+    since = len(world.sent[b"a"])
+    for _ in range(40):
+        journal.writer.note(Note.COMMAND, 7, "mod0", "eva", bytes(10_000), 0, "")
+    for _ in range(12):
+        world.gateway.tick()
+        world.frame(b"a", Up.CREDIT, link.JOURNAL | 7)
+    sizes = [len(body) for kind, *_, body in world.sent[b"a"][since:] if kind == Down.EVENTS]
+    assert max(sizes) < JOURNAL_BYTES + 11_000 and events(world, b"a", since) == list(range(1, 41))
+
+
+def test_a_right_that_ends_ends_the_following_at_once(world: World) -> None:
+    world.begin(b"a")
+    journal = follow(world, b"a")
+    since = len(world.sent[b"a"])
+    journal.writer.note(Note.CLOSED, 7, "mod0", "eva")
+    world.gateway.unfollow(world.session(b"a"))
+    world.gateway.tick()
+    kinds = [kind for kind, *_ in world.sent[b"a"][since:]]
+    assert journal.closed and Down.UNFOLLOWED in kinds and Down.EVENTS not in kinds
+    assert b"a" in world.gateway.sessions, "the session goes on"
+
+
+def test_a_journal_that_is_asked_for_again_replaces_the_first(world: World) -> None:
+    world.begin(b"a")
+    first, second = follow(world, b"a", 7), follow(world, b"a", 8)
+    assert first.closed and not second.closed and len(world.session(b"a").followed) == 1

@@ -11,8 +11,8 @@ import pytest
 import zmq
 
 from sioms.gateway import ways
-from sioms.gateway.core import Principal
 from sioms.gateway.inflow import Inflow
+from sioms.gateway.parts import Principal
 from sioms.gateway.stops import Stops
 from sioms.protocol.messages import decode_reply
 from sioms.protocol.verbs import EmergencyStop
