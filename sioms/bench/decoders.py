@@ -14,6 +14,7 @@ import tempfile
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib.metadata import entry_points
 from importlib.resources import files
 from pathlib import Path
@@ -36,7 +37,8 @@ from sioms.drivers.modbus.regmap_files import RegisterMapError, parse_map
 from sioms.drivers.schunk_ft.codec import parse as parse_schunk
 from sioms.gateway.core import OWN_NUMBERS, Gateway
 from sioms.gateway.parts import Principal
-from sioms.lab.arrays import UnreadableError, read_mat, read_npz
+from sioms.lab.arrays import UnreadableError, read_npz
+from sioms.lab.mat import read_mat
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.protocol import link, verbs, wire
 from sioms.protocol.clock import Wall
@@ -425,11 +427,16 @@ def _saved(save: Callable[[Any], None]) -> bytes:
         return file.read()
 
 
-def _mat(file: Any) -> None:
+def _mat(file: Any, packed: bool | None = None) -> None:
+    """Save a MAT file of version 5, packed or not, or of version 4."""
     from scipy.io import savemat
 
-    given = {"a": np.ones(3), "b": "text", "c": np.array([1, "x"], dtype=object)}
-    savemat(file, given, do_compression=True)
+    given: dict[str, Any] = {"a": np.ones(3), "b": "text", "d": np.ones((2, 2), "i2"), "z": np.ones(2) * 1j}
+    if packed is None:
+        savemat(file, given, format="4")
+        return
+    given |= {"c": np.array([1, "x"], dtype=object), "s": {"t": np.ones(4, "u1"), "deep": {"x": np.ones(2, "f4")}}}
+    savemat(file, given, do_compression=packed)
 
 
 def _finger() -> bytes:
@@ -531,7 +538,11 @@ TARGETS = {
         [_saved(lambda f: np.savez(f, raw=np.ones((2, 3)), time=np.arange(2.0)))],
         (ValueError,),
     ),
-    "mat": Target(_file(read_mat, ".mat"), [_saved(_mat)], (UnreadableError,)),
+    "mat": Target(
+        _file(read_mat, ".mat"),
+        [_saved(partial(_mat, packed=packed)) for packed in (True, False, None)],
+        (UnreadableError,),
+    ),
     "table": Target(_file(load_table, ".csv"), [b"time [s],position [m]\n0.0,1.0\n0.1,2.0\n0.2,3\n"], (BadInputError,)),
     "trace": Target(_file(read_trace, ".trace"), [TRACE], (BadTrace,)),
     "positions": Target(

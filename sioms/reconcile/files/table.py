@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.documents import read_bytes
-from sioms.lab.arrays import MOST_BYTES, UnreadableError, read_mat, read_npz
+from sioms.lab.arrays import MOST_BYTES, UnreadableError, read_npz
+from sioms.lab.mat import read_mat
 from sioms.protocol.flags import NodeClass
 from sioms.reconcile.errors import BadInputError
 from sioms.recording.tables import of_one_node

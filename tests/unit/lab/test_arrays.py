@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from scipy.io import savemat
 
 from sioms.lab import arrays
-from sioms.lab.arrays import UnreadableError, read_mat, read_npz
+from sioms.lab.arrays import UnreadableError, read_npz
+from sioms.lab.mat import read_mat
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.table import load_table
 
@@ -131,25 +132,6 @@ def test_objects_strings_and_cells_are_no_columns_and_no_code(tmp_path: Path) ->
     savemat(tmp_path / "a.mat", {"x": COLUMNS["x"], "words": "text", "cells": cells})
     for name in ("a.npz", "a.mat"):
         assert set(load_table(tmp_path / name).columns) == {"x"}
-
-
-def test_of_a_mat_file_the_library_is_given_arrays_of_numbers_only(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A damaged cell array ends the process in which the library reads it."""
-    cells = np.empty(1, dtype=object)
-    cells[0] = np.zeros(3)
-    kinds = {"cells": cells, "record": {"a": np.zeros(3)}, "words": "text", "flag": np.array([True]), "x": COLUMNS["x"]}
-    savemat(tmp_path / "a.mat", kinds)
-    asked: list[str] = []
-
-    def load(path: Path, *, squeeze_me: bool, variable_names: list[str]) -> dict[str, object]:
-        asked.extend(variable_names)
-        return {}
-
-    monkeypatch.setattr("scipy.io.loadmat", load)
-    read_mat(tmp_path / "a.mat")
-    assert "x" in asked and not {"cells", "record", "words"} & set(asked)
 
 
 def test_version_7_3_is_told(tmp_path: Path) -> None:
