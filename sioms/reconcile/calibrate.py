@@ -10,7 +10,7 @@ import numpy as np
 from sioms.reconcile.checks import LEAST_COUNTS
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem, block_ids, refit
-from sioms.reconcile.gaps import lap
+from sioms.reconcile.floor import lap
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, observer, sensor_noise
 from sioms.reconcile.records import Session

@@ -13,13 +13,17 @@ from scipy.stats import binom
 from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
+from sioms.reconcile.disturbance import disturbance
 from sioms.reconcile.effect import Array
 from sioms.reconcile.engine.evidence import alternative, outcome
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
 from sioms.reconcile.experiment import Envelope, Experiment, separate
 from sioms.reconcile.fit import Fit, Problem, refit
-from sioms.reconcile.gaps import measure, rungs, session_states
+from sioms.reconcile.floor import ON_MODEL, closed_floor
+from sioms.reconcile.free import freely
+from sioms.reconcile.gaps import free_gaps, measure, rungs, session_states
+from sioms.reconcile.judge import Judgement, judge
 from sioms.reconcile.locate import Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
@@ -30,7 +34,7 @@ from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
-from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, LOOPS, MOSTLY, QUIET, UNEXPLAINED
+from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MOSTLY, QUIET, UNEXPLAINED
 from sioms.reconcile.timed import as_recorded
 from sioms.reconcile.verdict import Gap, Outcome, Place
 
@@ -70,7 +74,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     rng = np.random.default_rng(o.seed)
     o.progress("untouched samples: gap before and after")
     states = session_states(ready.final, found.fit.model)
-    gaps = _gaps(ready, nominal, found.fit.model, states)
+    gaps, judged = _gaps(s, states, rng)
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
     spans = spans_of(whole, fit, others_as_deep)
@@ -81,8 +85,11 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
-    said = outcome(bool(named), bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd, bool(open_rivals))
-    notes = [*ready.notes]
+    missing = bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd or bool(judged.refusals)
+    said = outcome(bool(named), missing, bool(open_rivals))
+    if said is Outcome.UNEXPLAINED:
+        gaps = tuple(_beside_what_is_missing(g) for g in gaps)
+    notes = [*ready.notes, *judged.notes, *judged.refusals]
     notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
     if ready.held and any(e.name in TIMES for e in named):
         notes.append(HELD.format(0.5e3 * fit.model.sample_time_s))
@@ -90,8 +97,6 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes.append(_of_bursts(ready.problem, found.fit, burst))
     elif ratio > LARGE:
         notes.append(_of_much(ratio, s.share))
-    elif said is not Outcome.UNEXPLAINED:
-        notes += _of_loops(gaps, ratio)
     open_now = open_rivals if said is Outcome.AMBIGUOUS else []
     places, spectrum, traces = _pictures(ready, nominal, found.fit.model, o, rng)
     return AxisVerdict(
@@ -123,13 +128,24 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     )
 
 
-def _gaps(ready: Prepared, nominal: AxisModel, model: AxisModel, states: Sequence[State]) -> tuple[Gap, ...]:
-    """Measure the gaps; before, nothing was known of a force in time."""
-    gaps = measure(ready.final, nominal, model, states)
-    if not ready.timed or ready.apart:
-        return gaps
-    before = measure(as_recorded(ready.final, ready.timed), nominal, nominal)
-    return tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
+def _gaps(s: Searched, states: Sequence[State], rng: np.random.Generator) -> tuple[tuple[Gap, ...], Judgement]:
+    """Measure the gaps, and judge the model by its free run; before, nothing was known of a force in time."""
+    ready, nominal, model = s.ready, s.ready.nominal, s.found.fit.model
+    noise = disturbance(ready.problem, model, s.share)
+    floor = closed_floor(ready.final, model, noise, rng)
+    plain = ready.final if ready.apart else as_recorded(ready.final, ready.timed)
+    gaps = measure(ready.final, nominal, model, floor, states)
+    if ready.timed and not ready.apart:
+        before = measure(plain, nominal, nominal, floor)
+        gaps = tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
+    free = freely((plain, ready.final), (nominal, model), noise, rng)
+    judged = judge(ready.final, model, free, gaps)
+    return (*gaps, *free_gaps(free, nominal.position_unit)), judged
+
+
+def _beside_what_is_missing(gap: Gap) -> Gap:
+    """Take no floor for known that holds what is missing: one from what a model left, or above what it leaves here."""
+    return replace(gap, floor=np.nan) if gap.floor_from == ON_MODEL or gap.after <= gap.floor else gap
 
 
 def _last(problem: Problem, s: Searched, rng: np.random.Generator) -> tuple[Fit, ...]:
@@ -180,17 +196,6 @@ def _of_bursts(problem: Problem, fit: Fit, burst: float) -> str:
             "disturbance from outside"
         )
     return f"{text} that no state of the axis orders: a disturbance from outside, not an effect"
-
-
-def _of_loops(gaps: Sequence[Gap], ratio: float) -> list[str]:
-    """Say what it means that the closed loop is farther from its floor than short windows are."""
-    return [
-        f"in closed loop {g.after / g.floor:.1f} times the floor remains, in short windows {ratio:.2f} times the "
-        "noise: what is slow and too small for a "
-        "window, or when the axis sticks, differs each time; repeated laps would show the floor of that"
-        for g in gaps
-        if g.channel == "force, closed loop" and g.after > LOOPS * g.floor
-    ]
 
 
 def _plan(ready: Prepared, o: Options, model: AxisModel, open_rivals: Sequence[Rival]) -> Experiment | None:

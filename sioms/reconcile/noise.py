@@ -56,6 +56,15 @@ def alone(inertia: float, viscous: float, t: float) -> tuple[Array, Array]:
     )
 
 
+def sprung(inertia: float, viscous: float, stiffness: float, t: float) -> tuple[Array, Array]:
+    """Return one mass on a spring to ground, sampled exactly: state matrix (2, 2) and force input (2,)."""
+    rates = np.zeros((3, 3))
+    rates[0, 1] = 1.0
+    rates[1] = np.array([-stiffness, -viscous, 1.0]) / inertia
+    step = expm(rates * t)
+    return step[:2, :2], step[:2, 2]
+
+
 @dataclass(frozen=True, slots=True)
 class Pair:
     """Two masses and what is between them: inertia of both, share of the load in it, stiffness, damping, and the
@@ -82,6 +91,11 @@ def coupled(pair: Pair, sample_time_s: float) -> tuple[Array, Array]:
     rates[3] = np.array([k, d, -k, -d, 0.0]) / load
     step = expm(rates * sample_time_s)
     return step[:4, :4], step[:4, 4]
+
+
+def sampled_motion(inertia: float, viscous: float, pair: Pair | None, sample_time_s: float) -> tuple[Array, Array]:
+    """Return what moves, one mass or a pair, sampled exactly: state matrix (n, n) and force input (n,)."""
+    return alone(inertia, viscous, sample_time_s) if pair is None else coupled(pair, sample_time_s)
 
 
 def observer(model: AxisModel, sensor: float, drive: float) -> Noise:
@@ -170,7 +184,7 @@ def _transfer(
     noise: Noise, pair: Pair | None, inertia: float, viscous: float, sample_time_s: float
 ) -> tuple[Array, Array]:
     """Return numerator and denominator of ``response``."""
-    a, b = alone(inertia, viscous, sample_time_s) if pair is None else coupled(pair, sample_time_s)
+    a, b = sampled_motion(inertia, viscous, pair, sample_time_s)
     n = len(b)
     gain = np.array(corrections(noise, pair, sample_time_s))[:n]
     seen = np.eye(1, n)

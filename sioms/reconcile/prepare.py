@@ -9,7 +9,9 @@ import numpy as np
 
 from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
-from sioms.reconcile.checks import check, check_scale, runs_the_loop
+from sioms.reconcile.checks import check
+from sioms.reconcile.contradictions import check_columns, check_law
+from sioms.reconcile.controlled import runs_the_loop
 from sioms.reconcile.effects import library
 from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
@@ -17,6 +19,7 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.records import Session
 from sioms.reconcile.sampling import Sampling, read_as, sampling_of, trusted
+from sioms.reconcile.scale import check_scale
 from sioms.reconcile.timed import Timed, as_recorded, known_beside
 from sioms.reconcile.timing import on_grid
 
@@ -93,13 +96,17 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     notes += check(session, nominal)
     if session.final:
         check(Session(session.final), nominal)
+    check_columns(session, nominal)
     if session.loop_time_s is not None:
         late = 0.5 * session.loop_time_s / nominal.sample_time_s
         if late < OWN_PACE:
             return _read(session, nominal, notes, o, Sampling(late))
         return _channels(session, nominal, notes, o)
     ready = replace(_channels(session, nominal, notes, o), held=not runs_the_loop(session, nominal))
-    return reread(ready, ready.model, (), o) or ready
+    if (other := reread(ready, ready.model, (), o)) is not None:
+        return other
+    check_law(session, nominal)
+    return ready
 
 
 def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options) -> Prepared | None:

@@ -314,3 +314,15 @@ def track(
     if noise is not None and (unknown := _unknown_at_first(p, y, noise, pair, model)) is not None:
         start = _set_going(p, y, force, external, gain, start, *unknown)
     return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)
+
+
+def released(packed: Packed, force: Array, start: Array, external: Array | None = None) -> Run:
+    """Drive the plant with a recorded force while nothing holds it.
+
+    Args:
+        force: command to the drive, shape (n,), held over each sample, [{F}].
+        start: as the time step reads it, shape (7,).
+        external: force on the axis beside the drive's, shape (n,), [{F}]; None: none.
+    """
+    still = np.zeros(len(force))
+    return _march(packed, False, still, still, force, external, np.zeros(k.CTL_SIZE), IDLE, start)

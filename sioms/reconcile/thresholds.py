@@ -37,6 +37,30 @@ class Footing:
 AXIS = Footing(floor=1.05, tries=4, steps=6, paired=1.5, odd=1.25, trace=0.15)
 SENSOR = Footing(floor=1.15, tries=5, steps=8, paired=1.3, odd=1.15, trace=6.0)
 
+# --- when records contradict themselves
+
+TWICE = 0.9
+"""Rows come twice where so many of every other pair are equal in position and force, and the others are not. Forty
+axes: 0.07 at most; doubled rows 1 (0562)."""
+NOISY = 0.2
+"""A position whose third differences hold this share of its spread is noise, or in no order of time. Forty axes: 0.011
+at most; white noise 1 (0562)."""
+JUMP_TIMES, JUMP_COUNTS = 20.0, 8.0
+"""A position leaps where its bend is so many times what it is in all but a fiftieth of the samples, and so many
+counts. Forty axes: 4.2 times at most (0562)."""
+LAWLESS = 0.5
+"""A force of which the controller leaves more than this share is made by another one, or of another run. Forty axes:
+0.0015 at most (0562)."""
+UNRELATED = 0.3
+"""Force and motion have nothing to do with each other where inertia, friction and forces of place together explain less
+than this share of the force. Forty axes: 0.54 beside a gap, 0.74 else (0562)."""
+INERTIAS = 0.3, 21.0
+"""The inertia that force and motion show is between these multiples of the nominal one, by a payload; beyond them it
+is a unit, a sample time (every second row lost makes 0.25), or another axis. Forty axes: 0.51 to 2.95 (0562)."""
+UNLIKE = 3.5
+"""Records of one axis show inertias that differ by less than this factor. Forty axes: 2.8 under a drive that saturates,
+1.3 else; every second row lost in one of them makes 4 (0562)."""
+
 # --- when an effect counts
 
 GAIN = 0.05
@@ -113,8 +137,18 @@ than the last.
 """
 HOPELESS, HALF = 5.0, 0.33
 """Above this multiple, and with this share of the disagreement left, nothing is named at all."""
-LOOPS = 2.0
-"""It is said where the closed loop is beyond this multiple of its floor."""
+FREE_FLOORS, FREE_LEAST = 5.0, 0.05
+"""A model that runs free is refused above this multiple of what noise makes of it, where that is also more than this
+share of the motion, or of the force in closed loop. Forty axes: right models stay below 1.3 in closed loop (0560)."""
+FREE_SHARE = 0.15
+"""Without a closed loop a model runs free to within this share of the motion over at least one length of segment. Forty
+axes: right models 0.006 to 0.033 over 0.25 s; a resonator whose spring hardens 0.3 (0560)."""
+FREE_NEAR = 2.0
+"""Above this multiple of its floor it is said how far a free run stays from it. Forty axes (0560)."""
+STUCK = 0.2
+"""A model is at rest during at most this share of the way that the machine went. Forty axes: none at all (0560)."""
+GIVEN_POWER = 0.02
+"""What depends on speed gives at most this power to the axis, of the rated force's at the largest speed (0560)."""
 FELL = 0.7
 """The noise is taken again from what a search leaves when it fell below this share, and the search repeated."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from enum import Enum
@@ -80,7 +81,8 @@ class Gap:
 
     Attributes:
         before, after: root mean square, in ``unit``; frozen model parameters.
-        floor: what noise alone would leave, in ``unit``: an estimate of its own, which what is reached does not change.
+        floor: what noise alone would leave, in ``unit``: an estimate of its own, which what is reached does not change;
+            nan where nothing tells it from what is missing.
         frozen, session: on the later half of these samples only, frozen and with the session parameters
             re-estimated on the earlier half; None where that was not done.
         floor_from: how the floor was found, in words.
@@ -96,10 +98,17 @@ class Gap:
     floor_from: str = ""
 
     @property
+    def known(self) -> bool:
+        """Whether the floor is known."""
+        return not math.isnan(self.floor)
+
+    @property
     def closed(self) -> float:
         """Share of the gap above the floor that the model closes, at most 1; 0 where the gap did not stand above the
-        floor.
+        floor, nan where that is not known.
         """
+        if not self.known:
+            return math.nan
         gap = self.before - self.floor
         return min((self.before - self.after) / gap, 1.0) if gap > 0.0 else 0.0
 

@@ -44,7 +44,9 @@ def test_stribeck_friction_is_named_with_its_parameters_and_the_gap_closes(tmp_p
     assert values["Fc"] == pytest.approx(6.473, rel=0.02)
     assert values["Fs"] == pytest.approx(12.344, rel=0.02)
     assert values["vs"] == pytest.approx(0.009992, rel=0.05)
-    assert all(g["closed"] > 0.95 for g in found["gaps"])  # type: ignore[attr-defined]
+    gaps = {g["channel"]: g for g in found["gaps"]}  # type: ignore[attr-defined]
+    assert all(g["closed"] > 0.95 for name, g in gaps.items() if "whole" not in name)
+    assert gaps["force, closed loop"]["after"] == pytest.approx(gaps["force, closed loop"]["floor"], rel=0.34)
     page = (tmp_path / "report.html").read_text()
     assert "Stribeck" in page
     assert "data:image/png" in page

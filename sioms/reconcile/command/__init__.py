@@ -57,6 +57,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default=0,
         help="solve each so many times more with its blocks drawn anew",
     )
+    test.add_argument(
+        "--damaged", action="store_true", help="damage what is generated instead, in a hundred ways: nothing is named"
+    )
     effects = kinds.add_parser("effects", help="print the library of effects")
     effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)")
     effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
@@ -78,6 +81,10 @@ def run(args: argparse.Namespace) -> int:
             library.write(args.out)
         return 0
     _say_when_plain()
+    if args.subject == "selftest" and args.damaged:
+        from sioms.reconcile.command.damaged import damaged
+
+        return damaged(args.seed, main)
     if args.subject == "selftest" and args.kind != "axis":
         from sioms.reconcile.command.selftest_sensors import selftest as sensors
 

@@ -32,12 +32,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.documents import json_of, read_bytes, read_text
+from sioms.documents import json_of
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.contents import contents
 from sioms.reconcile.files.table import SUFFIXES, UNITS, load_table, measures, named, unit_of
 from sioms.reconcile.given import columns_in, number, only, parsed, table_in, truth, words
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.model_file import model_from, parse_model
+from sioms.reconcile.model_file import model_from
 from sioms.reconcile.records import Record, Session
 
 Array = NDArray[np.float64]
@@ -116,7 +117,7 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
             return Session(tuple(_record(f, plain, model) for f in files), True, (), None)
         raise BadInputError(f"read {data}: no column description (or give --columns): {_draft(files, description)}")
     where = f"read {description}"
-    table = parsed(read_bytes(description), where)
+    table = parsed(contents(description, where), where)
     only(table, ("sample_time_s", "loop_time_s", "files", "continuous", "final", "columns"), where)
     columns_of = columns_in(table, "columns", QUANTITIES, where)
     given = number(table, "sample_time_s", where, model.sample_time_s)
@@ -274,13 +275,12 @@ def read_model(path: Path) -> AxisModel:
     Raises:
         BadInputError: a key is missing, unknown or no number.
     """
-    if not path.exists():
-        raise BadInputError(f"read model {path}: no such file")
-    if path.suffix != ".json":
-        return parse_model(read_text(path), str(path))
     where = f"read model {path}"
+    raw = contents(path, where)
+    if path.suffix != ".json":
+        return model_from(parsed(raw, where), where)
     try:
-        given = json_of(read_bytes(path))
+        given = json_of(raw)
     except ValueError as e:
         raise BadInputError(f"{where}: {e}") from e
     if not isinstance(given, Mapping):

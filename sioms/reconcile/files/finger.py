@@ -17,9 +17,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from sioms.documents import read_bytes, read_text, toml_of
+from sioms.documents import read_text, toml_of
 from sioms.lab.arrays import UnreadableError, read_npz
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.contents import contents
 from sioms.reconcile.files.table import NUMBERS
 from sioms.reconcile.finger.belief import Belief
 from sioms.reconcile.finger.model_file import belief_of, check, corrected, from_table, to_toml
@@ -142,7 +143,7 @@ def read_experiments(data: Path) -> list[Experiment]:
 def _columns(path: Path) -> Mapping[str, Mapping[str, Any]]:
     if not path.exists():
         return {}
-    table = parsed(read_bytes(path), f"read {path}")
+    table = parsed(contents(path, f"read {path}"), f"read {path}")
     only(table, ("columns",), f"read {path}")
     return columns_in(table, "columns", ARRAYS, f"read {path}", keys=("name", "unit"), named=False)
 

@@ -22,8 +22,8 @@ from typing import Any
 
 import numpy as np
 
-from sioms.documents import read_bytes
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.contents import contents
 from sioms.reconcile.files.table import SUFFIXES, load_columns
 from sioms.reconcile.force.model_file import from_table
 from sioms.reconcile.force.plan import Plan
@@ -96,9 +96,7 @@ def read_model(path: Path) -> tuple[SensorModel, tuple[str, ...]]:
 
 
 def _toml(path: Path, what: str) -> dict[str, Any]:
-    if not path.exists():
-        raise BadInputError(f"read {what} {path}: no such file")
-    return parsed(read_bytes(path), f"read {what} {path}")
+    return parsed(contents(path, f"read {what} {path}"), f"read {what} {path}")
 
 
 def read_loads(data: Path, names: tuple[str, ...], columns: Path | None = None) -> ForceRecords:

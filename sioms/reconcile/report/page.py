@@ -133,6 +133,7 @@ def _gaps(p: Page, v: Verdict) -> None:
     rows = []
     for g in v.gaps:
         closed = f"{100 * g.closed:.1f} %" if of_axis or g.before > 1.15 * g.floor else "no gap"
+        closed = closed if g.known else "unknown"
         ends = [Cell(number(x)) for x in (g.before, g.after, g.floor)]
         row = [g.channel, *ends, g.unit, g.floor_from, Cell(closed)]
         later = [Cell("-" if x is None else number(x)) for x in (g.frozen, g.session)]

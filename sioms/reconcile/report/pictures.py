@@ -32,7 +32,8 @@ def pictures(v: Verdict) -> dict[str, Figure]:
     def sheet(height: float) -> Figure:
         return Figure(figsize=(11, height), layout="constrained")
 
-    out = {"gaps": _gap_picture(sheet(0.6 + 0.35 * len(v.gaps)), v.gaps)}
+    told = [g for g in v.gaps if g.known]
+    out = {"gaps": _gap_picture(sheet(0.6 + 0.35 * len(told)), told)} if told else {}
     if isinstance(v, AxisVerdict):
         if v.traces:
             out["curves"] = _trace_picture(sheet(1.9 * min(len(v.traces), 4) + 1), v)
@@ -77,7 +78,8 @@ def _gap_picture(figure: Figure, gaps: Sequence[Gap]) -> Figure:
 
 
 def _trace_picture(figure: Figure, v: AxisVerdict) -> Figure:
-    shown, floor = v.traces[:4], v.speaking.floor
+    shown = v.traces[:4]
+    floor = next((g.floor for g in reversed(v.gaps) if g.channel.startswith("force")), np.nan)
     rows = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for ax, t in zip(rows, shown, strict=True):
         step = max(len(t.time_s) // 3000, 1)
@@ -90,7 +92,7 @@ def _trace_picture(figure: Figure, v: AxisVerdict) -> Figure:
             label="simulated - measured, before",
         )
         ax.plot(t.time_s[::step], (t.after - t.measured)[::step], color="#08a", lw=0.7, label="after")
-        for side in (-1.0, 1.0):
+        for side in (-1.0, 1.0) if np.isfinite(floor) else ():
             ax.axhline(side * floor, color="#1c2733", lw=0.6, ls="--", label="noise floor" if side > 0 else None)
         settled = np.abs(t.before - t.measured)[len(t.measured) // 10 :]  # a record may begin in motion
         reach = float(np.quantile(settled, 0.998)) * 1.4 or 1.0

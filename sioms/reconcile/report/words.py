@@ -31,7 +31,7 @@ def headline(v: Verdict) -> str:
 
 def number(value: float) -> str:
     """Four significant digits."""
-    return f"{value:.4g}"
+    return "unknown" if math.isnan(value) else f"{value:.4g}"
 
 
 def span(p: Estimate) -> tuple[str, str, str]:
@@ -66,9 +66,8 @@ def summary(v: Verdict, out: str) -> list[str]:
 
 def shrunk(gap: Gap) -> str:
     """Say how far a gap shrank."""
-    return (
-        f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after, floor {number(gap.floor)} {gap.unit}"
-    )
+    ends = f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after"
+    return f"{ends}, floor {number(gap.floor)} {gap.unit}" if gap.known else f"{ends} {gap.unit}, floor unknown"
 
 
 def places(v: Verdict, most: int) -> str:
@@ -166,7 +165,7 @@ def _effect(e: NamedEffect) -> dict[str, Any]:
 def _gap(g: Gap, of_axis: bool) -> dict[str, Any]:
     table: dict[str, Any] = {
         "channel": g.channel, "unit": g.unit, "before": g.before, "after": g.after,
-        "floor": g.floor, "floor_from": g.floor_from, "closed": g.closed,
+        "floor": g.floor if g.known else None, "floor_from": g.floor_from, "closed": g.closed if g.known else None,
     }  # fmt: skip
     return table | ({"frozen_later_half": g.frozen, "session_later_half": g.session} if of_axis else {})
 

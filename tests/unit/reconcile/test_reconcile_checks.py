@@ -9,7 +9,7 @@ import pytest
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.checks import check
-from sioms.reconcile.gaps import lap, lap_floor
+from sioms.reconcile.floor import lap, lap_floor
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session

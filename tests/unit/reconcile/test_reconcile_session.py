@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.fit import Problem
+from sioms.reconcile.floor import OF_WINDOWS, Floor
 from sioms.reconcile.gaps import measure, session_states
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer
@@ -44,7 +45,7 @@ def test_a_new_session_is_estimated_and_judged_apart_from_the_frozen_model() -> 
     (state,) = session_states(p, MODEL)
     assert state.offset == pytest.approx(0.02, rel=0.1)
     assert state.dry == pytest.approx(1.15, rel=0.03)
-    for gap in measure(p, AXIS, MODEL, (state,)):
+    for gap in measure(p, AXIS, MODEL, Floor(1.0, 1.0, OF_WINDOWS), (state,)):
         assert gap.session is not None
         assert gap.frozen is not None
         assert gap.session < 0.3 * gap.frozen

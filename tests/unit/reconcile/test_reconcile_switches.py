@@ -7,19 +7,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sioms.reconcile.checks import check_scale
-from sioms.reconcile.conclude import _of_loops
 from sioms.reconcile.fit import Fit, Problem
-from sioms.reconcile.gaps import measure
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer
 from sioms.reconcile.plausible import physical, small
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.report.words import span
+from sioms.reconcile.scale import check_scale
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.switches import Switches
-from sioms.reconcile.thresholds import LOOPS
-from sioms.reconcile.verdict import Estimate, Gap
+from sioms.reconcile.verdict import Estimate
 from sioms.reconcile.windows import NUMBERS, Seen
 
 AXIS = AxisModel(
@@ -97,20 +94,6 @@ def test_an_inertia_that_is_hardly_a_payload_is_said(factor: float, said: bool) 
     notes = check_scale(problem, AXIS)
     assert bool(notes) is said
     assert not said or "turns for radians" in notes[0]
-
-
-def test_a_floor_is_the_same_whatever_model_is_measured_against_it() -> None:
-    problem, wrong = recorded(AXIS, noise=0.5), replace(AXIS, inertia=3e-3)
-    for gap, other in zip(measure(problem, wrong, AXIS), measure(problem, wrong, wrong), strict=True):
-        assert gap.floor == other.floor
-        assert gap.after < gap.before == other.after
-
-
-def test_a_closed_loop_far_above_its_floor_is_explained() -> None:
-    gap = Gap("force, closed loop", "N", 8.0, 0.2, 0.05)
-    (note,) = _of_loops([gap, replace(gap, channel="position, closed loop")], 1.1)
-    assert "4.0 times the floor" in note
-    assert _of_loops([replace(gap, floor=0.2 / (0.9 * LOOPS))], 1.1) == []
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import pytest
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.files.axis import read_data, read_model
-from sioms.reconcile.gaps import lap, lap_floor
+from sioms.reconcile.floor import lap, lap_floor
 from sioms.reconcile.prepare import UNTOUCHED, Options, prepare
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.timed import Timed

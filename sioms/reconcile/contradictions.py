@@ -1,0 +1,133 @@
+"""Records that contradict themselves, or the model they come with, are refused before anything is searched.
+
+Every column has a second witness: the controller makes the force from command and position, the motion needs the
+force, neighbours in time are alike, records of one axis show one inertia. Where the witnesses disagree, whatever a
+search found would be an account of the damage.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import replace
+
+import numpy as np
+
+from sioms.reconcile.controlled import FOREIGN, beyond_feedback
+from sioms.reconcile.effect import Array
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.records import Record, Session
+from sioms.reconcile.thresholds import JUMP_COUNTS, JUMP_TIMES, LAWLESS, NOISY, TWICE
+
+#: Samples (one row late is a way of logging, ``sampling``) that a column is looked for ahead or behind of the others.
+SHIFTS = (*range(2, 31), 40, 50, 60, 80, 100)
+#: A law that holds only otherwise leaves at most this share of what it leaves as the columns are named.
+BETTER = 0.2
+
+
+def check_columns(session: Session, model: AxisModel) -> None:
+    """Check every record by itself.
+
+    Raises:
+        BadInputError: with the record, what contradicts what, and what would be right.
+    """
+    for r in session.records + session.final:
+        where = f"read record {r.name}"
+        _check_rows(r, where)
+        _check_smooth(r, model, where)
+        _check_jumps(r, model, where)
+        _check_law(r, model, where)
+
+
+def _check_rows(r: Record, where: str) -> None:
+    """Find rows that come twice; a time column would have shown them."""
+    twice = (np.diff(r.position) == 0.0) & (np.diff(r.force) == 0.0)
+    moved = np.diff(r.position) != 0.0
+    for first in (0, 1):
+        pairs, between = twice[first::2], moved[1 - first :: 2]
+        if len(pairs) and np.mean(pairs) > TWICE and np.mean(between) > 1.0 - np.mean(pairs) + 0.1:
+            raise BadInputError(
+                f"{where}: {100 * np.mean(pairs):.0f} % of the rows come twice, and there is no time that would tell "
+                "them apart; needs every sample once, or a time column"
+            )
+
+
+def _check_smooth(r: Record, model: AxisModel, where: str) -> None:
+    """Find a position that is noise, or whose rows are in no order: neighbours in time must be alike."""
+    for name, a in (("position", r.position), ("command", r.command)):
+        if a is None or np.ptp(a) < 8.0 * model.resolution:
+            continue
+        noise = float(np.sqrt(np.mean(np.diff(a, 3) ** 2) / 20.0))
+        if noise > NOISY * float(np.std(a)):
+            raise BadInputError(
+                f"{where}: {name} changes from row to row as much as it does altogether "
+                f"({100 * noise / float(np.std(a)):.0f} %); "
+                "it is noise, or the rows are in no order of time"
+            )
+
+
+def _check_jumps(r: Record, model: AxisModel, where: str) -> None:
+    """Find places where the position leaps as no machine moves: a wrapped angle, lost counts, a flipped bit."""
+    bend = np.abs(np.diff(r.position, 2))
+    usual = float(np.quantile(bend, 0.98)) + JUMP_COUNTS * model.resolution
+    odd = np.flatnonzero(bend > JUMP_TIMES * usual)
+    if len(odd):
+        i = int(odd[0]) + 1
+        size = max(abs(r.position[i + 1] - r.position[i]), abs(r.position[i] - r.position[i - 1]))
+        raise BadInputError(
+            f"{where}: position leaps by {size:.4g} {model.position_unit} at sample {i} ({len(odd)} such places), "
+            f"{bend[i - 1] / usual:.0f} times as far as its motion goes elsewhere: a wrapped angle, lost counts or a "
+            "spike; unwrap it, or cut the record there"
+        )
+
+
+def _check_law(r: Record, model: AxisModel, where: str) -> None:
+    """Where the controller does not make the force, see whether it would if the columns were others.
+
+    A column that is another one, or stands some rows ahead of the others, shows so; a controller that is none of the
+    model's does not.
+    """
+    if model.controller is None or r.command is None or (given := beyond_feedback(r, model)) <= 0.1 * FOREIGN:
+        return
+    found = ((beyond_feedback(other, model), text) for text, other in _otherwise(r, r.command))
+    left, text = min(found, key=lambda f: f[0])
+    if left < min(BETTER * given, FOREIGN):
+        raise BadInputError(
+            f"{where}: the controller of the model makes the recorded force from command and position only if {text} "
+            f"(off by {100 * left:.2g} % of the force then, {100 * given:.3g} % as the columns are named)"
+        )
+
+
+def check_law(session: Session, model: AxisModel) -> None:
+    """Check that the controller has anything to do with the force, where the rows are those of its loop.
+
+    Raises:
+        BadInputError: it has not.
+    """
+    for r in session.records:
+        if model.controller is not None and (off := beyond_feedback(r, model)) > LAWLESS:
+            raise BadInputError(
+                f"read record {r.name}: the controller of the model does not make the recorded force from command and "
+                f"position (off by {100 * off:.0f} % of the force): it is that of another axis, the columns are of "
+                "different runs, or rows are missing; where only the controller is not known, or something is added to "
+                "its force, leave out [controller]"
+            )
+
+
+def _otherwise(r: Record, command: Array) -> Iterable[tuple[str, Record]]:
+    added = None if r.feedforward is None else -r.feedforward
+    yield "the sign of the force is turned round", replace(r, force=-r.force, feedforward=added)
+    yield "command and position are exchanged", replace(r, command=r.position, position=command)
+    if r.force_measured is not None:
+        yield "force and force_measured are exchanged", replace(r, force=r.force_measured)
+    yield "the command is turned round", replace(r, command=-command)
+    for n in SHIFTS:
+        for k in (n, -n):
+            part = slice(max(k, 0), len(r) + min(k, 0))
+            shifted = slice(max(-k, 0), len(r) + min(-k, 0))
+            moved = replace(r.only(part), force=r.force[shifted], feedforward=_cut(r.feedforward, shifted))
+            yield f"the force is taken {n} rows {'earlier' if k > 0 else 'later'}", moved
+
+
+def _cut(a: Array | None, part: slice) -> Array | None:
+    return None if a is None else a[part]

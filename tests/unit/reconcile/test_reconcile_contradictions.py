@@ -1,0 +1,154 @@
+"""Records that contradict themselves are refused before anything is searched, with what would be right."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sioms.reconcile.command import main
+from sioms.reconcile.command.damaged import COLUMNS, damaged, write
+from sioms.reconcile.contradictions import check_columns, check_law
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.axis import read_data, read_model
+from sioms.reconcile.model import AxisModel
+from sioms.reconcile.prepare import Options, prepare
+from sioms.reconcile.records import Record, Session
+from sioms.reconcile_selftest.damage import KINDS, Public
+
+AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
+Change = Callable[[Record], Record]
+
+
+@cache
+def given() -> tuple[Session, AxisModel]:
+    """Return an axis that hides nothing, without the time of its rows."""
+    model = read_model(AXES / "s05" / "nominal.json")
+    session = read_data(AXES / "s05", model)
+    return replace(session, records=tuple(replace(r, time_s=None) for r in session.records)), model
+
+
+def every(change: Change) -> Session:
+    """Change every record."""
+    session, _ = given()
+    return replace(session, records=tuple(change(r) for r in session.records))
+
+
+def rows(chosen: Callable[[int], np.ndarray]) -> Change:
+    """Take other rows."""
+    return lambda r: Record(r.name, **{name: a[chosen(len(r))] for name, a in r.arrays().items()})
+
+
+def noise(r: Record) -> Record:
+    rng = np.random.default_rng(len(r.name))
+    return replace(r, **{n: np.std(a) * rng.standard_normal(len(r)) for n, a in r.arrays().items() if n != "index"})
+
+
+def test_records_that_agree_with_themselves_pass() -> None:
+    prepare(*given(), Options(pictures=False))
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (rows(lambda n: np.repeat(np.arange(n), 2)), "come twice"),
+        (rows(lambda n: np.random.default_rng(1).permutation(n)), "no order of time"),
+        (noise, "it is noise"),
+        (lambda r: replace(r, position=r.command, command=r.position), "exchanged"),
+        (lambda r: replace(r, force=np.roll(r.force, 7)), "7 rows"),
+        (lambda r: replace(r, force=np.roll(r.force, 8)), "8 rows"),
+        (lambda r: replace(r, command=-r.command), "turned round"),
+        (lambda r: replace(r, position=r.position % (0.3 * np.ptp(r.position))), "leaps"),
+    ],
+)
+def test_a_contradiction_is_refused_with_its_reason(change: Change, said: str) -> None:
+    with pytest.raises(BadInputError, match=said):
+        check_columns(every(change), given()[1])
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (rows(lambda n: np.arange(0, n, 2)), "0.2[45]"),
+        (lambda r: replace(r, force=1e3 * r.force), "another unit"),
+        (lambda r: replace(r, force=np.roll(r.force, len(r) // 2)), "not of the same run|of another axis|turned round"),
+    ],
+)
+def test_without_a_controller_the_motion_is_the_witness(change: Change, said: str) -> None:
+    model = replace(given()[1], controller=None)
+    session = every(lambda r: change(replace(r, command=None, force_measured=None)))
+    with pytest.raises(BadInputError, match=said):
+        prepare(session, model, Options(pictures=False))
+
+
+def test_a_controller_that_has_nothing_to_do_with_the_force_is_of_another_axis() -> None:
+    session, model = given()
+    assert model.controller is not None
+    check_law(session, model)
+    other = replace(model, controller=replace(model.controller, k=4.0 * model.controller.k))
+    with pytest.raises(BadInputError, match="leave out"):
+        check_law(session, other)
+
+
+def test_one_record_of_another_rate_is_found_among_the_others() -> None:
+    session, model = given()
+    bare = tuple(replace(r, command=None, force_measured=None) for r in session.records)
+    odd = rows(lambda n: np.arange(0, n, 2))(bare[0])
+    with pytest.raises(BadInputError, match="compare records"):
+        prepare(replace(session, records=(odd, *bare[1:])), replace(model, controller=None), Options(pictures=False))
+
+
+def test_an_inertia_that_is_said_to_be_uncertain_may_be_any() -> None:
+    session, model = given()
+    wrong = replace(model, inertia=50.0 * model.inertia, controller=None)
+    with pytest.raises(BadInputError, match="refine"):
+        prepare(session, wrong, Options(pictures=False))
+    prepare(session, replace(wrong, refine=("inertia",)), Options(pictures=False))
+
+
+def public() -> Public:
+    """Lay the axis out as the self-test does."""
+    session, model = given()
+    n = 1200
+    runs = tuple(
+        {
+            "time": np.arange(n) * model.sample_time_s,
+            "counts": np.rint(r.position[:n] / model.resolution).astype(np.int64),
+            "command": r.command[:n],  # type: ignore[index]
+            "force": r.force[:n],
+            "force_measured": r.force_measured[:n],  # type: ignore[index]
+        }
+        for r in session.records[:2]
+    )
+    axis = {
+        "kind": "linear",
+        **{k: getattr(model, k) for k in ("sample_time_s", "inertia", "viscous", "resolution", "pitch")},
+        **{k: getattr(model, k) for k in ("rated_force", "max_speed")},
+    }
+    assert model.controller is not None
+    keys = ("k", "kz", "kp", "kb", "offset", "limit", "velocity_filter_hz", "velocity_mean")
+    return Public(runs, tuple(COLUMNS), {"axis": axis, "controller": {k: getattr(model.controller, k) for k in keys}})
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_kind_of_damage_makes_something_else(kind: str, tmp_path: Path) -> None:
+    """A kind that leaves everything as it was would be right by being wrong."""
+    one, other = public(), public()
+    other = other.each(lambda r: {k: a[::-1] for k, a in r.items()})
+    other = replace(other, model={k: dict.fromkeys(v, 2) for k, v in other.model.items()})
+    changed = KINDS[kind](one, other, np.random.default_rng(1))
+    for name, p in (("one", one), ("changed", changed)):
+        write(p, tmp_path / name)
+    files = [{f.name: f.read_bytes() for f in (tmp_path / n).iterdir()} for n in ("one", "changed")]
+    assert files[0] != files[1]
+
+
+def test_damage_to_files_and_models_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    kinds = ("NPZ of garbage", "MAT of version 7.3", "model of garbage", "time in minutes", "pitch no number")
+    assert damaged(3, main, kinds, pool=[(public(), public())]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("right  ") == len(kinds) and "traceback" in shown
