@@ -126,7 +126,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     capacity: int = 16384
     effects: dict[str, dict[str, Any]] = {}
     effects_file: str = ""
-    history: int = 64
+    history: int = 256
     late_max_s: float = 2.0
 
 
@@ -171,6 +171,7 @@ class SimAxes(TickDriver):
             markers=kit.markers,
             capacity=settings.capacity,
             late_max_s=settings.late_max_s,
+            makes_up=lambda: self._command is not None and not self._is_still,
         )
         self._axes, self._plant = AxisBlock(axes, self.bank), AnalogBlock(plant)
         self._port = BinaryBlock(port[0]) if port else None
@@ -213,7 +214,7 @@ class SimAxes(TickDriver):
         """Let the world go on under the last command up to now, measure, and command anew.
 
         The controller of a device does not miss its turns because this machine was busy: after a late tick they are
-        made up for, a few at once. Later than ``late_max_s`` the bank stops all motion.
+        made up for, a few at once, and shown each at its own time. Later than ``late_max_s`` the bank stops all motion.
         """
         if self._found:
             found, self._found = self._found, 0
@@ -227,7 +228,10 @@ class SimAxes(TickDriver):
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
         if now_ns - self._last_ns <= self._late_ns:
             while behind > self._stride:
-                self._turn(self._last_ns + self._stride * self._tick_ns, self._stride)
+                at_ns = self._last_ns + self._stride * self._tick_ns
+                self._turn(at_ns, self._stride)
+                for block in self.blocks:  # what looks at these axes sees them go there
+                    self.kit.publish(block, at_ns)
                 behind -= self._stride
         self._turn(now_ns, behind)
 

@@ -75,7 +75,7 @@ class SimForceSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     model_file: str = ""
     seed: int = 0
     tick_hz: float = 1000.0
-    history: int = 64
+    history: int = 256
 
 
 class SimForce(TickDriver):
@@ -112,6 +112,9 @@ class SimForce(TickDriver):
         self._twin = _twin(settings.model_file) if settings.model_file else None
         self._forces, self._seen = np.zeros((2, len(settings.contact)))
         self._limit = np.array(settings.limit)
+        self._period_ns = round(1e9 / settings.tick_hz)
+        self._last_ns = 0
+        self._missing = self._rested = False
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -119,7 +122,12 @@ class SimForce(TickDriver):
         return (self._block,)
 
     def tick(self, now_ns: int) -> None:
-        """Read the contacts; one whose device is not there presses nothing and makes the reading invalid."""
+        """Read the contacts; one whose device is not there presses nothing and makes the reading invalid.
+
+        A sensor does not miss its samples because this machine was busy: after a late tick they are made up for, each
+        with what pressed at its own time.
+        """
+        self._make_up(now_ns)
         missing = False
         for index, contact in enumerate(self.settings.contact):
             reading = self.kit.inputs[contact.node].read(now_ns)
@@ -127,6 +135,34 @@ class SimForce(TickDriver):
                 reading = None
             missing |= reading is None
             self._forces[index] = 0.0 if reading is None else reading["value"][0]
+        self._sample(now_ns, missing)
+        self._last_ns, self._missing, self._rested = now_ns, missing, False
+
+    def _make_up(self, now_ns: int) -> None:
+        """Publish the samples that have been missed since the last tick, unless they were left out at rest."""
+        late = (now_ns - self._last_ns) // self._period_ns - 1 if self._last_ns and not self._rested else 0
+        if late <= 0:
+            return
+        news: list[tuple[int, str, float]] = []
+        for node in dict.fromkeys(contact.node for contact in self.settings.contact):
+            fresh = self.kit.inputs[node].fresh(now_ns)
+            news += [(stamp_ns, node, float(reading["value"][0])) for stamp_ns, reading in fresh]
+        news.sort()
+        made_up = min(late, self.settings.history // 2)
+        lost, at = int(AnalogStatus.OVERRUN) * (made_up < late), 0
+        for number in range(made_up, 0, -1):
+            sample_ns = now_ns - number * self._period_ns
+            while at < len(news) and news[at][0] <= sample_ns:
+                for index, contact in enumerate(self.settings.contact):
+                    if contact.node == news[at][1]:
+                        self._forces[index] = news[at][2]
+                at += 1
+            self._sample(sample_ns, self._missing)
+            self._block.flags |= lost
+            self.kit.publish(self._block, sample_ns)
+            lost = 0
+
+    def _sample(self, now_ns: int, missing: bool) -> None:
         data, sensor, time_s = self._block.data, self._sensor, now_ns * 1e-9
         if self._twin is None:
             sensor.read(self._forces, data, time_s)
@@ -138,9 +174,9 @@ class SimForce(TickDriver):
 
     def is_at_rest(self) -> bool:
         """Whether the contacts press as they did at the last look: noise that nobody sees need not be made."""
-        at_rest = bool((self._forces == self._seen).all())
+        self._rested = bool((self._forces == self._seen).all())
         self._seen[:] = self._forces
-        return at_rest
+        return self._rested
 
 
 def _sensor(settings: SimForceSettings, flaws: Flaws | None) -> ForceSensor:

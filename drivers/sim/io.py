@@ -215,13 +215,21 @@ class SimIo(TickDriver):
         return edges
 
     def _beam_edges(self, now_ns: int) -> list[tuple[Edge, int]]:
-        """Sample the beams at every snapshot of the nodes, at the nodes' own time: a late tick misses none."""
+        """Sample the beams at every snapshot of the nodes, at the nodes' own time: a late tick misses none.
+
+        Where it is so late that snapshots have been overwritten, edges are counted as lost.
+        """
         if not self._beams:
             return []
         news: dict[int, dict[int, float]] = {}
         for index, node in enumerate(self._nodes):
-            for stamp_ns, reading in self.kit.inputs[node].fresh(now_ns):
-                news.setdefault(stamp_ns, {})[index] = float(reading["value"][0])
+            source = self.kit.inputs[node]
+            fresh = [(stamp_ns, float(reading["value"][0])) for stamp_ns, reading in source.fresh(now_ns)]
+            for stamp_ns, position in fresh:
+                news.setdefault(stamp_ns, {})[index] = position
+            moved = fresh and fresh[0][1] != self._positions.get(index, fresh[0][1])
+            if source.missed and moved and self._inputs is not None:  # whether it came and went, nobody can tell
+                self._inputs.count_lost(0, 2)
         edges = []
         for stamp_ns in sorted(news):
             self._positions.update(news[stamp_ns])

@@ -7,7 +7,7 @@ bank.py, which plan an axis runs and what follows it in sequencer.py.
 from __future__ import annotations
 
 import errno
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,8 @@ class AxisBank(Bank):
         markers: seam to the marker table.
         capacity: commands that each axis' buffer holds.
         late_max_s: a tick that comes later than this after its predecessor stops all motion [s].
+        makes_up: tells whether late ticks are made up for, each at its own time, as those of a simulated device are;
+            a verb then acts within a tick after the last, because the axes have come no further.
 
     ``arrays`` are those of the loop by name (``axis_step.Loop``), to be read.
     ``stepper`` (n,) tells which entries of tick()'s answer are raw output positions; the others are forces or torques.
@@ -58,6 +60,7 @@ class AxisBank(Bank):
         markers: MarkerPort,
         capacity: int = 16384,
         late_max_s: float = 0.05,
+        makes_up: Callable[[], bool] = lambda: False,
     ) -> None:
         super().__init__(settings, markers, capacity, passing=True)
         n = self.n
@@ -87,7 +90,7 @@ class AxisBank(Bank):
         self._limp, self._actuator, self._last_raw = self._law.limp, self._law.actuator, arrays["last_raw"]
         self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
         self._any_limp = False
-        self._tick_s = tick_s
+        self._tick_s, self._makes_up = tick_s, makes_up
 
     def plan_ahead(self, count: int = 32) -> int:
         """Plan up to ``count`` next commands (10 to 20 us each), in the slack between ticks.
@@ -103,9 +106,14 @@ class AxisBank(Bank):
         """Return now, or the instant of the last tick when the next is late already.
 
         A late tick stops what moves where it was last put out; a verb that comes before it must not let
-        the set-points run on to now.
+        the set-points run on to now. Where late ticks are made up for, it must not let them run on past the first of
+        these.
         """
-        return self._last_ns if self._seen and now_ns - self._last_ns > self._late_ns else now_ns
+        if not self._seen:
+            return now_ns
+        if now_ns - self._last_ns > self._late_ns:
+            return self._last_ns
+        return min(now_ns, self._last_ns + round(self._tick_s * 1e9)) if self._makes_up() else now_ns
 
     def _catch_up(self, now_ns: int) -> int:
         now_ns = self._instant(now_ns)

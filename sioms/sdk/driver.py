@@ -65,6 +65,10 @@ class InputNode(Protocol):
         """Return all snapshots since the last look, oldest first, as (stamp_ns, readings)."""
 
     @property
+    def missed(self) -> int:
+        """Snapshots that had been overwritten before the last call of ``fresh`` looked at them."""
+
+    @property
     def stamp_ns(self) -> int:
         """Time stamp of what was returned last [ns]."""
 

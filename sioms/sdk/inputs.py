@@ -31,7 +31,7 @@ class Input:
 
     def __init__(self, name: str) -> None:
         self.name = name
-        self.stamp_ns = self.as_of_ns = 0
+        self.stamp_ns = self.as_of_ns = self.missed = 0
         self._number = 0
         self._reader: PageReader | None = None
         self._map: mmap.mmap | None = None
@@ -104,9 +104,10 @@ class Input:
     def fresh(self, now_ns: int) -> list[tuple[int, Mapping[str, NDArray[Any]]]]:
         """Return all snapshots since the last look, oldest first, as (stamp_ns, readings as of ``read``).
 
-        None is lost as long as the looks are no further apart than what the page keeps; nothing comes
-        while the device is not there.
+        None is lost as long as the looks are no further apart than what the page keeps; ``missed`` is how many were.
+        Nothing comes while the device is not there.
         """
+        self.missed = 0
         if self._reader is None:
             return []
         try:
@@ -115,10 +116,13 @@ class Input:
             return []
         reader, head = self._reader, self._reader.head
         first = max(self._number + 1, head - reader.slots + 2, 1) if self._number else max(head, 1)
+        self.missed = first - self._number - 1 if self._number else 0
         found = []
         for number in range(first, head + 1):
             raw = reader.numbered(number)
-            if raw is not None:
+            if raw is None:
+                self.missed += 1  # overwritten meanwhile
+            else:
                 self._number, self.stamp_ns, _ = slot_header(raw)
                 self.as_of_ns = as_of_ns(raw)
                 found.append((self.stamp_ns, self._readings(reader, raw)))

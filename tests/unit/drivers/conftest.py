@@ -6,9 +6,11 @@ import os
 import numpy as np
 import pytest
 
-from sioms.protocol.flags import PageState
+from sioms.protocol.flags import NodeClass, PageState
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.page import PageWriter, page_size
+from sioms.protocol.records import read_rows
+from sioms.sdk.blocks import AxisBlock
 from sioms.sdk.inputs import Input
 from sioms.sdk.markers import Markers
 
@@ -19,6 +21,7 @@ class Bench:
     def __init__(self):
         self.clock_ns = 1_000_000_000
         self.published = []
+        self._shown = {}
         self.inputs = {}
         self.markers = Markers(MarkerTable(memoryview(bytearray(TABLE_SIZE))), lambda number: None)
         self._pages = []
@@ -34,7 +37,8 @@ class Bench:
         raise AssertionError(source)
 
     def publish(self, block, stamp_ns):
-        self.published.append((int(block.data[0]), int(block.rows["changed_ns"][0])))
+        if block.spec.node_class is NodeClass.BINARY:
+            self.published.append((int(block.data[0]), int(block.rows["changed_ns"][0])))
         self._publish(block, stamp_ns)
 
     def make(self, driver, name, table):
@@ -93,6 +97,17 @@ class Bench:
         writer = next(writer for candidate, writer in self._pages if candidate is block)
         writer.alive(self.clock_ns)
         writer.publish(block.payload(), stamp_ns, 0, 0)
+        fields = block.bank.fields if isinstance(block, AxisBlock) else block.fields
+        first = {name: float(row[0]) for name, row in read_rows(block.spec.node_class, fields).items()}
+        self._shown.setdefault(id(block), []).append((stamp_ns, first, fields.copy()))
+
+    def shown(self, block, count=1000):
+        """Return the last publications of a block: time stamp, and the columns of its first channel."""
+        return [(stamp_ns, first) for stamp_ns, first, _ in self._shown[id(block)][-count:]]
+
+    def forces(self, block):
+        """Return the third component of all publications of a force sensor."""
+        return [float(fields[0, 2]) for _, _, fields in self._shown[id(block)]]
 
 
 @pytest.fixture

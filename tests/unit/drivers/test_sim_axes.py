@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 
 from sioms.drivers.sim.axes import SimAxes
-from sioms.protocol.flags import AxisStatus, ControlMode
+from sioms.drivers.sim.io import SimIo
+from sioms.motion.queue import verdict
+from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
+from sioms.protocol.records import numpy_dtype
 
 SERVO = {
     "name": "x", "velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 60.0,
@@ -282,3 +285,41 @@ def test_a_starved_machine_moves_as_a_free_one(bench, bandwidth_hz):
     assert not status(mod) & AxisStatus.FAULT and mod.bank.is_idle([0])
     assert mod.bank.rows["position"][0] == pytest.approx(0.3, abs=2e-4)
     assert worst < 2 * 6.0 / (2 * np.pi * bandwidth_hz) ** 2 + 0.002
+
+
+def test_a_late_tick_shows_every_turn_that_it_makes_up_for(bench):
+    """Another device's beam sees an axis that came and went meanwhile."""
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO]})
+    box = {"bit": 0, "boxes": [{"mod0.plant.x_position": [0.0045, 0.2]}]}
+    io = bench.make(SimIo, "io0", {"inputs": 1, "beam": [box]})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.0055)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.0)
+    bench.clock_ns += 45_000_000
+    bench.run(0.001)
+    turns = [stamp for stamp, _ in bench.shown(mod.blocks[1])][-20:]
+    assert max(np.diff(turns)) <= 4_000_000
+    bench.clock_ns += 45_000_000
+    bench.run(0.5)
+    assert [value for value, _ in bench.published if value] == [1], "broken once"
+    assert io.blocks[0].edges[0] == 2
+
+
+@pytest.mark.parametrize("verb", ["stop", "emergency_stop", "replace"])
+def test_no_verb_has_set_points_run_ahead_of_a_late_world(bench, verb):
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO | {"following_error_max": 0.05}], "late_max_s": 0.1})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.VELOCITY, velocity=0.5)
+    bench.run(0.3)
+    bench.clock_ns += 90_000_000
+    if verb == "replace":
+        record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+        record["control_mode"], record["position"] = int(ControlMode.POSITION), 0.0
+        mod.bank.take(verdict(mod.bank.judge(record, [0], bench.clock_ns, replace=True)), bench.clock_ns)
+    else:
+        getattr(mod.bank, verb)([0], bench.clock_ns)
+    bench.run(0.001)
+    turns = bench.shown(mod.blocks[0], 95)
+    steps = np.diff([fields["commanded_position"] for _, fields in turns]) / np.diff([stamp for stamp, _ in turns])
+    assert max(abs(steps)) < 0.51e-9, "no further than a turn goes at 0.5 m/s"
+    assert not status(mod) & AxisStatus.FAULT

@@ -187,3 +187,36 @@ def test_a_twin_takes_its_elements_and_effects_from_a_model_and_shows_which(benc
 def test_bad_finger_is_told_by_describe(table, words):
     with pytest.raises(ValueError, match=words):
         SimTactile.describe("tactile0", msgspec.convert(table, SimTactile.Settings))
+
+
+def test_a_late_force_sensor_makes_up_for_its_samples_with_what_pressed_at_the_time(bench):
+    """A press that came and went during a late tick is in the samples; those left out at rest are not made up for."""
+    mod = bench.make(SimAxes, "mod0", {"axis": TWO})
+    contact = {"node": "mod0.plant.z_contact", "direction": [0.0, 0.0, 1.0]}
+    table = {"contact": [contact], "noise": [0.0] * 6, "history": 256}
+    sensor = bench.make(SimForce, "force0", table)
+    bench.run(0.05)
+    (block,), plant = sensor.blocks, mod.blocks[1]
+
+    def tick():
+        sensor.tick(bench.clock_ns)
+        bench._publish(block, bench.clock_ns)
+
+    count = len(bench.shown(block))
+    assert sensor.is_at_rest()
+    bench.clock_ns += 40_000_000
+    tick()
+    assert len(bench.shown(block)) == count + 1, "left out"
+    for at_ms in range(40):
+        bench.clock_ns += 1_000_000
+        plant.data[3] = 5.0 if 10 <= at_ms < 20 else 0.0
+        bench._publish(plant, bench.clock_ns)
+    tick()
+    made_up = bench.shown(block)[count + 1 :]
+    assert [bench.clock_ns - stamp for stamp, _ in made_up] == [late * 1_000_000 for late in range(39, -1, -1)]
+    z = bench.forces(block)[-40:]
+    assert [at for at, force in enumerate(z) if abs(force - 5.0) < 0.1] == [*range(10, 20)]
+    bench.clock_ns += 200_000_000
+    tick()
+    overrun = [int(fields["flags"]) & AnalogStatus.OVERRUN != 0 for _, fields in bench.shown(block)[-129:]]
+    assert overrun == [True] + 128 * [False], "what cannot be made up for is told"

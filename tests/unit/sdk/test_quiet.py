@@ -30,6 +30,8 @@ class Kit:
 
     def log(self, level, text): ...
 
+    def publish(self, block, stamp_ns): ...
+
 
 class Cell:
     """A driver with its pages, ticked as the loop does, by steps where it may."""
