@@ -222,13 +222,15 @@ class TactileNodes:
         from sioms.tactile.sensing import ShapeSensor
 
         settings = self._settings
-        return ShapeSensor(
+        sensor = ShapeSensor(
             finger,
             compiled=settings.compiled,
             conductor=settings.conductor,
             tare=_tare(settings),
             settle_frames=settings.settle_frames,
         )
+        sensor.warm()
+        return sensor
 
 
 def _tare(settings: ShapeSettings) -> LoadTare | None:

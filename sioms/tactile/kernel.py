@@ -15,6 +15,7 @@ import importlib.util
 from collections.abc import Callable
 from enum import IntEnum
 from functools import lru_cache
+from types import FunctionType
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Products = tuple[float, float, float, float, float, float, float, float, float, float]
-# fits (nodes, first, step, width_step, weights, y, pull, load, load_weight, t, b, widest b) -> (t, b, ten
-# products, iterations)
-Fit = Callable[..., tuple[float, float, Products, int]]
-# solves one frame, see `_solver` -> (status, t, b, ten products, iterations, sum of weights)
+# solves one frame, see `_solve` -> (status, t, b, ten products, iterations, sum of weights)
 Solve = Callable[..., tuple[int, float, float, Products, int, float]]
 
 MOST_STEPS = 100
@@ -172,67 +170,66 @@ def _products_loops(
     return ff, ft, fb, fy, tt, tb, ty, bb, by, yy
 
 
-def _build(products: Callable[..., Products]) -> Fit:
-    """Return the search over the given scalar products; its body is also what numba compiles."""
+_products: Callable[..., Products] = _products_numpy
 
-    def fit(
-        nodes: Floats,
-        first: float,
-        step: float,
-        width_step: float,
-        weights: Floats,
-        y: Floats,
-        pull: Floats,
-        load: float,
-        load_weight: float,
-        t: float,
-        b: float,
-        top_b: float,
-    ) -> tuple[float, float, Products, int]:
-        top_t = first + step * (nodes.shape[1] - 1)
-        b = min(b, top_b)
-        at = products(nodes, first, step, width_step, weights, y, pull, load, load_weight, t, b)
-        ff, fy = at[0] + load_weight, at[3] + load_weight * load
-        cost = at[9] - max(fy, 0.0) ** 2 / ff
-        damping = 1e-3
-        steps = 0
-        while steps < MOST_STEPS:
-            steps += 1
-            p = fy / ff
-            # a load of the wrong sign gives no direction: fall back on a small positive one
-            p = max(p, LEAST_LOAD)
-            gain_t, gain_b = p * (at[6] - p * at[1]), p * (at[8] - p * at[2])
-            tt, bb = p * p * (at[4] - at[1] ** 2 / ff), p * p * (at[7] - at[2] ** 2 / ff)
-            tb = p * p * (at[5] - at[1] * at[2] / ff)
-            lt, lb = tt * (1.0 + damping) + 1e-30, bb * (1.0 + damping) + 1e-30
-            det = lt * lb - tb * tb
-            move_t, move_b = (lb * gain_t - tb * gain_b) / det, (lt * gain_b - tb * gain_t) / det
-            if b + move_b < 0.0 or b + move_b > top_b:
-                # the least of the quadratic lies on the bound, and there at another t
-                move_b = min(max(move_b, -b), top_b - b)
-                move_t = (gain_t - tb * move_b) / lt
-            # one pitch at most, because the model turns over within about that distance, and not off the table;
-            # the whole step is shortened: a part of it need not lead downhill
-            room = min(0.1, top_t - t if move_t > 0.0 else t - first)
-            share = min(1.0, room / max(abs(move_t), 1e-30))
-            new_t, new_b = t + share * move_t, min(max(b + share * move_b, 0.0), top_b)
-            promised = (new_t - t) * gain_t + (new_b - b) * gain_b
-            try_at = products(nodes, first, step, width_step, weights, y, pull, load, load_weight, new_t, new_b)
-            try_ff, try_fy = try_at[0] + load_weight, try_at[3] + load_weight * load
-            try_cost = try_at[9] - max(try_fy, 0.0) ** 2 / try_ff
-            gained = cost - try_cost
-            if gained >= -1e-12 * abs(cost):
-                t, b, at, ff, fy, cost = new_t, new_b, try_at, try_ff, try_fy, try_cost
-            if promised < _TOLERANCE:
-                break
-            # at the ends of the arc the model bends so that undamped steps leap to and fro across a narrow valley
-            if gained < 0.3 * promised:
-                damping = max(10.0 * damping, 1e-3)
-            elif gained > 0.7 * promised:
-                damping = max(0.1 * damping, 1e-9)
-        return t, b, at, steps
 
-    return fit
+def _fit(
+    nodes: Floats,
+    first: float,
+    step: float,
+    width_step: float,
+    weights: Floats,
+    y: Floats,
+    pull: Floats,
+    load: float,
+    load_weight: float,
+    t: float,
+    b: float,
+    top_b: float,
+) -> tuple[float, float, Products, int]:
+    """Search over the scalar products `_products`; numba compiles the same body, see `_bound`."""
+    top_t = first + step * (nodes.shape[1] - 1)
+    b = min(b, top_b)
+    at = _products(nodes, first, step, width_step, weights, y, pull, load, load_weight, t, b)
+    ff, fy = at[0] + load_weight, at[3] + load_weight * load
+    cost = at[9] - max(fy, 0.0) ** 2 / ff
+    damping = 1e-3
+    steps = 0
+    while steps < MOST_STEPS:
+        steps += 1
+        p = fy / ff
+        # a load of the wrong sign gives no direction: fall back on a small positive one
+        p = max(p, LEAST_LOAD)
+        gain_t, gain_b = p * (at[6] - p * at[1]), p * (at[8] - p * at[2])
+        tt, bb = p * p * (at[4] - at[1] ** 2 / ff), p * p * (at[7] - at[2] ** 2 / ff)
+        tb = p * p * (at[5] - at[1] * at[2] / ff)
+        lt, lb = tt * (1.0 + damping) + 1e-30, bb * (1.0 + damping) + 1e-30
+        det = lt * lb - tb * tb
+        move_t, move_b = (lb * gain_t - tb * gain_b) / det, (lt * gain_b - tb * gain_t) / det
+        if b + move_b < 0.0 or b + move_b > top_b:
+            # the least of the quadratic lies on the bound, and there at another t
+            move_b = min(max(move_b, -b), top_b - b)
+            move_t = (gain_t - tb * move_b) / lt
+        # one pitch at most, because the model turns over within about that distance, and not off the table;
+        # the whole step is shortened: a part of it need not lead downhill
+        room = min(0.1, top_t - t if move_t > 0.0 else t - first)
+        share = min(1.0, room / max(abs(move_t), 1e-30))
+        new_t, new_b = t + share * move_t, min(max(b + share * move_b, 0.0), top_b)
+        promised = (new_t - t) * gain_t + (new_b - b) * gain_b
+        try_at = _products(nodes, first, step, width_step, weights, y, pull, load, load_weight, new_t, new_b)
+        try_ff, try_fy = try_at[0] + load_weight, try_at[3] + load_weight * load
+        try_cost = try_at[9] - max(try_fy, 0.0) ** 2 / try_ff
+        gained = cost - try_cost
+        if gained >= -1e-12 * abs(cost):
+            t, b, at, ff, fy, cost = new_t, new_b, try_at, try_ff, try_fy, try_cost
+        if promised < _TOLERANCE:
+            break
+        # at the ends of the arc the model bends so that undamped steps leap to and fro across a narrow valley
+        if gained < 0.3 * promised:
+            damping = max(10.0 * damping, 1e-3)
+        elif gained > 0.7 * promised:
+            damping = max(0.1 * damping, 1e-9)
+    return t, b, at, steps
 
 
 def drawn_frame(
@@ -262,67 +259,71 @@ class Status(IntEnum):
     WRONG_SIGN = 2
 
 
-def _solver(fit: Fit) -> Solve:
-    """Return one frame's whole work: weights, touch or not, best pattern, search; numba compiles its body too.
+def _solve(
+    nodes: Floats,
+    first: float,
+    step: float,
+    width_step: float,
+    bank: Floats,
+    bank_square: Floats,
+    places: Floats,
+    noise: Floats,
+    share: Floats,
+    least: float,
+    y: Floats,
+    pull: Floats,
+    load: float,
+    load_weight: float,
+    top_b: float,
+    start_t: float,
+    start_b: float,
+) -> tuple[int, float, float, Products, int, float]:
+    """Do one frame's whole work: weights, touch or not, best pattern, search.
 
     The search starts from `start_t`, `start_b` unless `start_b` is negative.
     """
+    blank = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    square = y * y
+    if (square / noise).sum() < least:
+        return 1, 0.0, 0.0, blank, 0, 0.0
+    weights = 1.0 / (noise + share * square.max())
+    if start_b < 0.0:
+        score = bank @ (weights * y)
+        explained = score * np.abs(score) / (bank_square @ weights)
+        best = np.argmax(explained)
+        # a pull: turned over, some touch explains more
+        if explained[best] <= -explained.min():
+            return 2, 0.0, 0.0, blank, 0, 0.0
+        start_t, start_b = places[best, 0], places[best, 1]
+    t, b, at, steps = _fit(
+        nodes,
+        first,
+        step,
+        width_step,
+        weights,
+        y,
+        pull,
+        load,
+        load_weight,
+        float(start_t),
+        float(start_b),
+        top_b,
+    )
+    return 0, t, b, at, steps, weights.sum()
 
-    def solve(
-        nodes: Floats,
-        first: float,
-        step: float,
-        width_step: float,
-        bank: Floats,
-        bank_square: Floats,
-        places: Floats,
-        noise: Floats,
-        share: Floats,
-        least: float,
-        y: Floats,
-        pull: Floats,
-        load: float,
-        load_weight: float,
-        top_b: float,
-        start_t: float,
-        start_b: float,
-    ) -> tuple[int, float, float, Products, int, float]:
-        blank = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        square = y * y
-        if (square / noise).sum() < least:
-            return 1, 0.0, 0.0, blank, 0, 0.0
-        weights = 1.0 / (noise + share * square.max())
-        if start_b < 0.0:
-            score = bank @ (weights * y)
-            explained = score * np.abs(score) / (bank_square @ weights)
-            best = np.argmax(explained)
-            # a pull: turned over, some touch explains more
-            if explained[best] <= -explained.min():
-                return 2, 0.0, 0.0, blank, 0, 0.0
-            start_t, start_b = places[best, 0], places[best, 1]
-        t, b, at, steps = fit(
-            nodes,
-            first,
-            step,
-            width_step,
-            weights,
-            y,
-            pull,
-            load,
-            load_weight,
-            float(start_t),
-            float(start_b),
-            top_b,
-        )
-        return 0, t, b, at, steps, weights.sum()
 
-    return solve
+def _bound(function: Callable[..., Any], **names: Any) -> Any:
+    """Return a function that finds others under these names of its module.
+
+    The next process finds it in the cache of numba, which compiles a function that encloses another anew each time.
+    """
+    return FunctionType(function.__code__, {**function.__globals__, **names}, function.__name__)
 
 
 @lru_cache(maxsize=1)
 def plain() -> Solve:
     """Return the solver in plain numpy."""
-    return _solver(_build(_products_numpy))
+    return _solve
 
 
 @lru_cache(maxsize=1)
@@ -338,5 +339,6 @@ def compiled() -> Solve:
         )
     numba: Any = importlib.import_module("numba")
     jit = numba.njit(cache=True, error_model="numpy")
-    solver: Solve = jit(_solver(jit(_build(jit(_products_loops)))))
+    fit = jit(_bound(_fit, _products=jit(_products_loops)))
+    solver: Solve = jit(_bound(_solve, _fit=fit))
     return solver

@@ -138,6 +138,13 @@ class ShapeSensor:
         self._rebasing: Rebase | None = None
         self._last = nothing(Quality.NO_BASELINE)
 
+    def warm(self) -> None:
+        """Fit a touch of the finger's own table, so that the first real one takes no longer than the others: what
+        numba has compiled is loaded with the first fit, which takes as long as hundreds of frames.
+        """
+        nodes = self._estimator.table.nodes
+        self._estimator.frame(50.0 * nodes[nodes.shape[0] // 2, nodes.shape[1] // 2, 0])
+
     def zero(self) -> None:
         """Forget the baseline and take a new one from the next frames, whatever they show; the finger must be
         untouched.

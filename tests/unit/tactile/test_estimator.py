@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sioms.tactile import emap, series
+from sioms.tactile import emap, kernel, series
 from sioms.tactile.closedform import equivalent_radius
 from sioms.tactile.cylinder import FINGER_B
 from sioms.tactile.estimator import Estimator
@@ -271,3 +271,17 @@ def test_no_touch_of_the_table_fits_better_than_the_estimate(nominal: Finger) ->
         allowed = (p > 0.0) & (widths.product(square) <= 1.5 * FINGER_B.outer_m * p)
         rival = np.sum((frame - p[:, None] * bank) ** 2, axis=1)[allowed].min() / 1e-6
         assert 13.0 * shape.misfit < rival + 0.5  # less is no difference
+
+
+def test_what_is_compiled_can_be_read_from_the_cache() -> None:
+    pytest.importorskip("numba")
+    functions = [kernel.compiled()]
+    for _ in range(2):
+        inner = [
+            found for name, found in functions[-1].py_func.__globals__.items() if name in ("_fit", "_products")
+            and name in functions[-1].py_func.__code__.co_names
+        ]  # fmt: skip
+        functions += inner
+    assert [function.py_func.__name__ for function in functions] == ["_solve", "_fit", "_products_loops"]
+    # numba compiles a function that encloses a compiled one anew in each process, and keeps each result for ever
+    assert not any(function.py_func.__closure__ for function in functions)

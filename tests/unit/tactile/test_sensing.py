@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sioms.tactile import kernel
 from sioms.tactile.finger import Finger
 from sioms.tactile.quality import Load, Quality
 from sioms.tactile.sensing import CHANNELS, LoadTare, ShapeSensor, numbers
@@ -147,3 +148,14 @@ def test_gain_matrix_mixes_outputs_and_refuses_nonsense(nominal) -> None:
     ):
         with pytest.raises(ValueError, match=words):
             rig.sensor.set_gains(bad)
+
+
+def test_a_sensor_that_is_warm_has_fitted_and_forgotten_it(nominal: Finger) -> None:
+    pytest.importorskip("numba")
+    solver = kernel.compiled()
+    cold, warm = (ShapeSensor(nominal, compiled=True, settle_frames=2) for _ in range(2))
+    warm.warm()
+    assert solver.nopython_signatures  # type: ignore[attr-defined]  # loaded
+    raw = np.zeros(len(nominal.angles_rad))
+    for stamp_ns in (1, 2, 3):
+        assert numbers(cold.frame(raw, stamp_ns)) == pytest.approx(numbers(warm.frame(raw, stamp_ns)), nan_ok=True)
