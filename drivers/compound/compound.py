@@ -39,7 +39,7 @@ from sioms.motion.axis_step import FORCE, HOLD, STOP
 from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import WRITE
-from sioms.sdk.blocks import AxisBlock, BlockSpec, Description
+from sioms.sdk.blocks import AnyBlock, AxisBlock, BlockSpec, Description
 from sioms.sdk.driver import HeldNode, Kit, TickDriver
 from sioms.sdk.exchange import LinkError
 from sioms.sdk.inputs import NotMeasuredError
@@ -124,6 +124,11 @@ class Compound(TickDriver):
         """Return the map; raises ValueError with a sentence."""
 
     @classmethod
+    def presses(cls, settings: Any, axis: Any) -> bool:
+        """Return whether a coordinate takes force commands."""
+        return bool(axis.force_node)
+
+    @classmethod
     def describe(cls, name: str, settings: Any) -> Description:
         """Tell the coordinates, and what is held and read."""
         cls.transform(settings)
@@ -146,7 +151,9 @@ class Compound(TickDriver):
                 raise ValueError(f"axis {axis.name}: force_age_s {axis.force_age_s:g}; want a positive number of s")
         for given in _settings(cls, settings):
             assert given.modes
-        channels = tuple(_channel(cls.COORDINATES[axis.name], axis) for axis in settings.axis)
+        channels = tuple(
+            _channel(cls.COORDINATES[axis.name], axis, cls.presses(settings, axis)) for axis in settings.axis
+        )
         block = BlockSpec("", NodeClass.AXIS, channels, history=settings.history, capacity=settings.capacity)
         felt = tuple(dict.fromkeys(axis.force_node for axis in settings.axis if axis.force_node))
         return Description((block,), settings.tick_hz, felt, holds=tuple(settings.axes))
@@ -174,7 +181,7 @@ class Compound(TickDriver):
         self._halted = False
 
     @property
-    def blocks(self) -> Sequence[AxisBlock]:
+    def blocks(self) -> Sequence[AnyBlock]:
         """The coordinates."""
         return (self._block,)
 
@@ -294,6 +301,7 @@ class Compound(TickDriver):
             at - rate * (stamp - stamp_ns) * 1e-9 if math.isfinite(rate) else at
             for at, rate, stamp in zip(joints, rates, stamps, strict=True)
         ]
+        joints = self.bent(joints, load)
         try:
             found = list(self._map.forward(joints))
         except ValueError as error:
@@ -303,6 +311,15 @@ class Compound(TickDriver):
                 found[i] = self._at[i] + math.remainder(found[i] - self._at[i], math.tau)
         self._joints, self._at, self._block.stamp_ns = joints, found, stamp_ns
         return status, load
+
+    def bent(self, joints: list[float], load: Sequence[float]) -> list[float]:
+        """Return where the joints are behind what gives between their encoders and the mechanics; here nothing does.
+
+        Args:
+            joints: as the held axes show them.
+            load: force [N] or torque [N m] with which each drives.
+        """
+        return joints
 
     def _lose(self, why: str) -> NoReturn:
         self._stop()
@@ -385,20 +402,33 @@ class Compound(TickDriver):
         found = []
         for i, axis in enumerate(self.settings.axis):
             if loop["kind"][i] == FORCE:
-                oldest_ns = now_ns - round(axis.force_age_s * 1e9)
                 try:
-                    felt = float(self.kit.inputs[axis.force_node].measured(now_ns, oldest_ns)[0])
+                    rate = self.pressing(i, float(loop["actuator"][i]), now_ns)
                 except NotMeasuredError as unknown:
                     self.bank.fault(self._all, f"axis {axis.name}: no force is known: {unknown}", now_ns)
                     return [0.0] * self.bank.n
-                felt *= axis.force_scale
-                rate = axis.damper * (float(loop["actuator"][i]) - felt)
                 most = float(loop["velocity_limit"][i])
                 found.append(min(max(rate, -most), most))
             else:
                 error = float(loop["desired"][i] - loop["position"][i])
                 found.append(float(loop["desired_velocity"][i]) + axis.gain * error)
         return found
+
+    def pressing(self, index: int, wanted: float, now_ns: int) -> float:
+        """Return the velocity of a coordinate that shall press with a force.
+
+        Args:
+            index: of the coordinate.
+            wanted: the force [N or N m].
+            now_ns: time of the tick.
+
+        Raises:
+            NotMeasuredError: no force is known.
+        """
+        axis = self.settings.axis[index]
+        oldest_ns = now_ns - round(axis.force_age_s * 1e9)
+        felt = float(self.kit.inputs[axis.force_node].measured(now_ns, oldest_ns)[0]) * axis.force_scale
+        return float(axis.damper * (wanted - felt))
 
     def _shown(self) -> list[float]:
         return [float(p) for p in self.bank.rows["position"]]
@@ -408,8 +438,8 @@ class Compound(TickDriver):
         return [float(p - o) for p, o in zip(shown, self.bank.arrays["offset"], strict=True)]
 
 
-def _modes(axis: Any) -> ControlMode:
-    return MODES | ControlMode.FORCE if axis.force_node else MODES
+def _modes(presses: bool) -> ControlMode:
+    return MODES | ControlMode.FORCE if presses else MODES
 
 
 def _k(axis: Any) -> float:
@@ -426,18 +456,23 @@ def _settings(kind: type[Compound], settings: Any) -> list[AxisSettings]:
         from_table(
             AxisSettings,
             axis,
-            {"kind": AxisKind.SERVO, "unit": kind.COORDINATES[axis.name], "modes": _modes(axis), "k": _k(axis)},
+            {
+                "kind": AxisKind.SERVO,
+                "unit": kind.COORDINATES[axis.name],
+                "modes": _modes(kind.presses(settings, axis)),
+                "k": _k(axis),
+            },
         )
         for axis in settings.axis
     ]
 
 
-def _channel(unit: str, axis: Any) -> ChannelInfo:
+def _channel(unit: str, axis: Any, presses: bool) -> ChannelInfo:
     limits = {"velocity": axis.velocity_max, "acceleration": axis.acceleration_max}
     if axis.jerk_max is not None:
         limits["jerk"] = axis.jerk_max
-    if axis.force_node:
+    if presses:
         limits["force"] = axis.force_max
     return ChannelInfo(
-        axis.name, unit, axis.position_min, axis.position_max, 0, int(_modes(axis)), limits, axis.description
+        axis.name, unit, axis.position_min, axis.position_max, 0, int(_modes(presses)), limits, axis.description
     )  # fmt: skip

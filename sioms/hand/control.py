@@ -89,17 +89,9 @@ class Controller:
                 "want finite numbers"
             )
         gains = self.gains
-        share = 1.0 if gains.filter_s == 0.0 else -math.expm1(-sample_s / gains.filter_s)
-        self.felt += share * (force - self.felt)
-        error = wanted - self.felt
-        touches = force > gains.contact_n or self.felt > gains.contact_n
-        if touches:
-            opening = -gains.damper * error
-        else:
-            opening = along[3] + gains.spring_rate * (goal[3] - now[3] - error / gains.spring)
-        opening = min(max(opening, -gains.opening_max), gains.opening_max)
+        opening, touches = self.squeeze(goal[3], along[3], now[3], wanted, force, sample_s)
         k = gains.position
-        x, y, psi, turn1, turn2 = self._by_links(opening, now) if touches and gains.link_m else (0.0,) * 5
+        x, y, psi, turn1, turn2 = self.by_links(opening, now) if touches and gains.link_m else (0.0,) * 5
         return (
             along[0] + k * (goal[0] - now[0]) + x,
             along[1] + k * (goal[1] - now[1]) + y,
@@ -109,7 +101,28 @@ class Controller:
             along[5] + k * math.remainder(goal[5] - now[5], math.tau) + turn2,
         )
 
-    def _by_links(self, opening: float, now: Sequence[float]) -> tuple[float, float, float, float, float]:
+    def feel(self, force: float, sample_s: float) -> bool:
+        """Take a sample of the force [N]; return whether there is contact."""
+        gains = self.gains
+        share = 1.0 if gains.filter_s == 0.0 else -math.expm1(-sample_s / gains.filter_s)
+        self.felt += share * (force - self.felt)
+        return force > gains.contact_n or self.felt > gains.contact_n
+
+    def squeeze(
+        self, goal: float, along: float, now: float, wanted: float, force: float, sample_s: float
+    ) -> tuple[float, bool]:
+        """Return the rate of d [m/s], and whether there is contact; the arguments are those of `rates`, for d."""
+        touches = self.feel(force, sample_s)
+        return self.opening(goal, along, now, wanted, touches), touches
+
+    def opening(self, goal: float, along: float, now: float, wanted: float, touches: bool) -> float:
+        """Return the rate of d [m/s] for the force that was felt last."""
+        gains, error = self.gains, wanted - self.felt
+        spring = along + gains.spring_rate * (goal - now - error / gains.spring)
+        opening = -gains.damper * error if touches else spring
+        return min(max(opening, -gains.opening_max), gains.opening_max)
+
+    def by_links(self, opening: float, now: Sequence[float]) -> tuple[float, float, float, float, float]:
         """Return what to add to the rates of x, y, psi, phi1, phi2, so that the carriages stay and the links open."""
         _, _, psi, d, phi1, phi2 = now
         length, half = self.gains.link_m, 0.5 * opening

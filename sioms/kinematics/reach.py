@@ -72,4 +72,5 @@ class Reach:
         rates = list(self.transform.joint_rates(coordinates, wanted))
         ways = [abs(rate) / joint.velocity for rate, joint in zip(rates, self.joints, strict=True)]
         share = 1.0 / max(1.0, *ways)
-        return [rate * share for rate in rates], share
+        most = [joint.velocity for joint in self.joints]  # what rounding leaves above it would be refused
+        return [min(max(rate * share, -top), top) for rate, top in zip(rates, most, strict=True)], share

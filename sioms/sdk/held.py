@@ -23,8 +23,9 @@ from sioms.protocol.verbs import Ioctl, Keepalive, Message, Write
 
 _RECORD = WRITE_STRUCT[NodeClass.AXIS]
 _NAMES = list(WRITE[NodeClass.AXIS])
-_VELOCITY, _TIME = _NAMES.index("velocity"), _NAMES.index("time")
-_JOG = int(ControlMode.VELOCITY | ControlMode.SPECIFIED_TIME)
+_VELOCITY = _NAMES.index("velocity")
+_JOG = int(ControlMode.VELOCITY)
+"""A velocity without a time lasts until the next command; one with a time the bank would judge the long way."""
 NEVER_NS = 2**62
 _MOST_ANSWERS = 64
 """Answers that are looked at in a tick; there is one to each command."""
@@ -57,7 +58,7 @@ class Held:
         """Numbers of the wait for a stop by somebody, of the last reset, and of the command that is not answered."""
         self._wanted: Sequence[float] | None = None
         self._record: list[Any] = [0] * len(_NAMES)
-        self._record[1], self._record[_TIME] = _JOG, -1.0
+        self._record[1] = _JOG
 
     def attach(self, fd: int, channels: Sequence[Sequence[Any]]) -> None:
         """Take the node: the socket of its handle, and its packed channels."""

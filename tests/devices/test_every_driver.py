@@ -18,8 +18,8 @@ import sioms
 every_rig = pytest.mark.parametrize("rig", RIGS, ids=lambda rig: rig.title)
 
 
-OVER_OTHERS = {"gantry", "slits"}
-"""Drivers whose axes are those of other devices: tests/process/test_compound.py."""
+OVER_OTHERS = {"gantry", "hand", "slits"}
+"""Drivers whose axes are those of other devices: tests/process/test_compound.py, tests/unit/drivers/test_hand.py."""
 
 
 def test_every_registered_driver_has_a_rig() -> None:

@@ -64,3 +64,11 @@ def test_the_slowest_joint_slows_all_alike() -> None:
     rates, share = reach.rates([0.0, 0.0, 0.0], [0.2, 0.2, 0.0])
     assert share == pytest.approx(0.5)
     assert rates == pytest.approx([0.1, 0.1, 0.1])
+
+
+def test_rates_that_are_scaled_down_stay_within_the_limits() -> None:
+    joints = [Joint("x", "m", velocity=3.0), Joint("y1", "m", velocity=0.7), Joint("y2", "m", velocity=0.7)]
+    reach = Reach(Gantry(1.0), joints)
+    for i in range(1, 2000):  # rounding would take some of them beyond
+        rates, _ = reach.rates([0.0, 0.0, 0.0], [3.0 + 0.001 * i, 0.7 + 0.013 * i, 0.0])
+        assert abs(rates[0]) <= 3.0 and max(map(abs, rates[1:])) <= 0.7

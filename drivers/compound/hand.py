@@ -1,0 +1,286 @@
+"""A hand: two modules with a finger each; coordinates x, y, psi, d, phi1 and phi2 (sioms.hand.kinematics).
+
+A device made of devices, see drivers/compound/README.md. With a table ``squeeze`` d takes force commands: an internal
+force [N], positive squeezes. In free space d then yields as a virtual spring about where it was, in contact it follows
+the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. The node
+``force`` shows that force and how late all this is.
+
+    [device.hand]
+    driver = "hand"
+    axes = ["left.x", "left.y", "left.th", "right.x", "right.y", "right.th"]
+    [device.hand.squeeze]
+    fingers = ["touch1.shape", "touch2.shape"]
+    [[device.hand.axis]]
+    name = "x"
+    velocity_max = 0.2
+    acceleration_max = 2.0
+    ...
+
+Lengths in metres, angles in radians.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, ClassVar, Literal
+
+import msgspec
+
+from sioms.hand.control import Controller, Gains
+from sioms.hand.felt import felt, internal_force, wrist_force
+from sioms.hand.kinematics import COORDINATES, LINK_M, UNITS, Hand
+from sioms.hand.statics import damped_limit
+from sioms.motion.axis_step import FORCE
+from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.driver import Kit
+from sioms.sdk.inputs import NotMeasuredError
+
+from .compound import Compound, CompoundSettings
+
+D, PSI = COORDINATES.index("d"), COORDINATES.index("psi")
+_TH = (2, 5)
+_SHARE = 0.05  # of a new torque in the bend of a link: a servo that chases its encoder's steps does not shake d
+_INVALID = int(AnalogStatus.INVALID)
+_CHANNELS = (
+    ("force", "N", "internal force, from what `squeeze` reads; positive squeezes"),
+    ("filtered", "N", "the same behind the law's low-pass"),
+    ("force_age", "s", "age of the older of its two readings"),
+    ("late", "s", "age of the oldest position of a held axis"),
+    ("loop", "s", "from the stamp of the newest force reading to the axes' commands of this tick"),
+)
+
+
+class SqueezeTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """How the hand squeezes.
+
+    Attributes:
+        fingers: nodes ``shape`` of the two fingers; their loads are the force.
+        wrists: nodes of two force sensors instead, with the axes of the platen; their fx and fy are read first.
+        length_m: of the contact along a finger: force over line load.
+        damper: K_v [m/(s N)].
+        spring_rate, spring: K_d [1/s] and K_s [N/m] of the virtual spring.
+        filter_s: time constant of the force's low-pass [s].
+        opening_max: fastest d opens or closes by these laws [m/s].
+        contact_n: force from which on there is contact [N].
+        by: what moves: "links" alone, whose axes are soft, or "carriages".
+        stiffness, damping: of everything between d and the force [N/m, N s/m]: K_v above what they allow is refused.
+        age_max_s: an older reading is none.
+    """
+
+    fingers: tuple[str, str] | None = None
+    wrists: tuple[str, str] | None = None
+    length_m: float = 20e-3
+    damper: float = 0.4
+    spring_rate: float = 5.0
+    spring: float = 100.0
+    filter_s: float = 0.02
+    opening_max: float = 0.1
+    contact_n: float = 0.02
+    by: Literal["links", "carriages"] = "links"
+    stiffness: float = 7.0
+    damping: float = 0.6
+    age_max_s: float = 0.05
+
+
+class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """Keys of a hand.
+
+    Attributes:
+        link1_m, link2_m: from the revolute axis of a module to its finger's centre.
+        least_m: the least d that has a direction; how far the hand may close says the d of the coordinates.
+        link_stiffness: of each link and its finger behind the encoder of its axis [N m/rad]; infinite: none gives.
+        squeeze: how it squeezes; without it d takes no force commands.
+    """
+
+    link1_m: float = LINK_M
+    link2_m: float = LINK_M
+    least_m: float = 1e-3
+    link_stiffness: float = math.inf
+    squeeze: SqueezeTable | None = None
+    tick_hz: float = 400.0
+
+
+class HandDriver(Compound):
+    """Held axes: x, y and th of module 1, then of module 2.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    Settings = HandSettings
+    COORDINATES: ClassVar = dict(zip(COORDINATES, UNITS, strict=True))
+
+    @classmethod
+    def transform(cls, settings: HandSettings) -> Hand:
+        """Return the map."""
+        return Hand(settings.link1_m, settings.link2_m, settings.least_m)
+
+    @classmethod
+    def presses(cls, settings: HandSettings, axis: Any) -> bool:
+        """Return whether a coordinate takes force commands: d does."""
+        return axis.name == "d" and settings.squeeze is not None
+
+    @classmethod
+    def describe(cls, name: str, settings: HandSettings) -> Description:
+        """Tell the coordinates and the force."""
+        base = super().describe(name, settings)
+        if any(axis.force_node for axis in settings.axis):
+            raise ValueError("axis: has a force_node; want the table squeeze, which says from where the force comes")
+        if not settings.link_stiffness > 0.0:
+            raise ValueError(f"link_stiffness {settings.link_stiffness:g} N m/rad; want more than 0")
+        squeeze = settings.squeeze
+        if squeeze is None:
+            return base
+        _check(squeeze, settings)
+        channels = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _CHANNELS)
+        block = BlockSpec("force", NodeClass.ANALOG, channels, history=settings.history)
+        return Description((*base.blocks, block), base.tick_hz, _nodes(squeeze), holds=base.holds)
+
+    def __init__(self, name: str, settings: HandSettings, kit: Kit) -> None:
+        super().__init__(name, settings, kit)
+        squeeze = settings.squeeze
+        self._controller = Controller(_gains(squeeze, settings)) if squeeze is not None else None
+        self._shown_force = AnalogBlock(self.describe(name, settings).blocks[1]) if squeeze is not None else None
+        self._force: float | None = None
+        self._why = "not read yet"
+        self._force_age_s = math.inf
+        self._touches = False
+        self._was_ns = self._newest_ns = 0
+        self._about: float | None = None  # d about which the spring yields
+        self._bend = [0.0, 0.0]
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The coordinates, and the force."""
+        return (self._block,) if self._shown_force is None else (self._block, self._shown_force)
+
+    def tick(self, now_ns: int) -> None:
+        """Take the force, then as any device made of devices."""
+        seen_ns = self._newest_ns
+        if self._controller is not None:
+            self._feel(self._controller, now_ns)
+        super().tick(now_ns)
+        if self._shown_force is not None:
+            self._show(self._shown_force, now_ns, self._newest_ns != seen_ns)
+
+    def bent(self, joints: list[float], load: Sequence[float]) -> list[float]:
+        """Return the joints with the links turned by what their drives' torques bend them."""
+        for n, i in enumerate(_TH):
+            self._bend[n] += _SHARE * (load[i] / self.settings.link_stiffness - self._bend[n])
+            joints[i] -= self._bend[n]
+        return joints
+
+    def pressing(self, index: int, wanted: float, now_ns: int) -> float:
+        """Return the velocity of d: by the damper law in contact, as a spring about where it was in free space.
+
+        Raises:
+            NotMeasuredError: no force is known.
+        """
+        if self._force is None or self._controller is None:
+            raise NotMeasuredError(self._why)
+        d = self._at[D]
+        if self._about is None or self._touches:
+            self._about = d
+        return self._controller.opening(self._about, 0.0, d, wanted, self._touches)
+
+    def _wanted(self, now_ns: int) -> list[float]:
+        """Return the velocities of the coordinates; in contact the links alone squeeze."""
+        wanted = super()._wanted(now_ns)
+        controller = self._controller
+        if controller is None or self.bank.arrays["kind"][D] != FORCE:
+            self._about = None
+            return wanted
+        if self._touches and controller.gains.link_m:
+            x, y, psi, turn1, turn2 = controller.by_links(wanted[D], self._at)
+            for i, by in zip((0, 1, 2, 4, 5), (x, y, psi, turn1, turn2), strict=True):
+                wanted[i] += by
+        return wanted
+
+    def _feel(self, controller: Controller, now_ns: int) -> None:
+        """Read the force; remember why there is none."""
+        squeeze: SqueezeTable = self.settings.squeeze
+        sample_s = max((now_ns - self._was_ns) * 1e-9, 0.1 / self.settings.tick_hz) if self._was_ns else 0.0
+        self._was_ns = now_ns
+        rows, oldest_ns, newest_ns = [], now_ns, 0
+        self._force = None
+        for node in _nodes(squeeze):
+            reading = self.kit.inputs[node].read(now_ns)
+            if reading is None:
+                self._why = f"{node}: it cannot be read; want its device up"
+                return
+            stamp_ns = self.kit.inputs[node].stamp_ns
+            oldest_ns, newest_ns = min(oldest_ns, stamp_ns), max(newest_ns, stamp_ns)
+            if now_ns - stamp_ns > squeeze.age_max_s * 1e9:
+                self._why = f"{node}: its reading is {(now_ns - stamp_ns) * 1e-9:.3f} s old; want {squeeze.age_max_s} s"
+                return
+            rows.append(reading)
+        self._force_age_s, self._newest_ns = (now_ns - oldest_ns) * 1e-9, newest_ns
+        self._force = _internal(squeeze, [row["value"] for row in rows], self._at)
+        if self._force is None:
+            self._why = "a finger cannot tell whether anything touches it"
+            return
+        self._touches = controller.feel(self._force, sample_s)
+
+    def _show(self, block: AnalogBlock, now_ns: int, is_new: bool) -> None:
+        """Fill the node ``force``."""
+        force, felt_n = self._force, self._controller.felt if self._controller else 0.0
+        block.flags[:2] = 0 if force is not None else _INVALID
+        loop_s = (self.kit.now_ns() - self._newest_ns) * 1e-9 if is_new and self._drives else math.nan
+        block.flags[4] = 0 if math.isfinite(loop_s) else _INVALID
+        late_s = (now_ns - self._block.stamp_ns) * 1e-9
+        block.data[:] = (math.nan if force is None else force, felt_n, self._force_age_s, late_s, loop_s)
+
+
+def _nodes(squeeze: SqueezeTable) -> tuple[str, ...]:
+    return squeeze.fingers or squeeze.wrists or ()
+
+
+def _internal(squeeze: SqueezeTable, rows: Sequence[Any], at: Sequence[float]) -> float | None:
+    one, two = rows
+    if squeeze.fingers:
+        return internal_force(felt(one.tolist(), squeeze.length_m), felt(two.tolist(), squeeze.length_m))
+    return wrist_force(one[:2].tolist(), two[:2].tolist(), at[PSI], squeeze.contact_n) if at else 0.0
+
+
+def _gains(squeeze: SqueezeTable, settings: HandSettings) -> Gains:
+    """Return the gains of the law.
+
+    Raises:
+        ValueError: one that cannot be.
+    """
+    d = settings.axis[D]
+    link_m = 0.5 * (settings.link1_m + settings.link2_m) if squeeze.by == "links" else 0.0
+    return Gains(
+        position=d.gain, spring_rate=squeeze.spring_rate, spring=squeeze.spring, damper=squeeze.damper,
+        filter_s=squeeze.filter_s, opening_max=squeeze.opening_max, contact_n=squeeze.contact_n, link_m=link_m,
+    )  # fmt: skip
+
+
+def _check(squeeze: SqueezeTable, settings: HandSettings) -> None:
+    """Refuse what cannot squeeze.
+
+    Raises:
+        ValueError: with a sentence.
+    """
+    if (squeeze.fingers is None) == (squeeze.wrists is None):
+        raise ValueError("squeeze: has neither or both of fingers and wrists; want one of them")
+    if not 0.0 < squeeze.length_m < math.inf or not 0.0 < squeeze.age_max_s < math.inf:
+        raise ValueError(
+            f"squeeze: length_m {squeeze.length_m:g}, age_max_s {squeeze.age_max_s:g}; want more than 0, finite"
+        )
+    if not 0.0 < squeeze.stiffness < math.inf or not 0.0 <= squeeze.damping < math.inf:
+        raise ValueError(
+            f"squeeze: stiffness {squeeze.stiffness:g}, damping {squeeze.damping:g}; want more than 0, and 0 or more"
+        )
+    _gains(squeeze, settings)
+    limit = damped_limit(squeeze.stiffness, squeeze.damping, 1.0 / settings.tick_hz)
+    if not squeeze.damper < limit:
+        raise ValueError(
+            f"squeeze: damper {squeeze.damper:g} m/(s N) is unstable at {settings.tick_hz:g} Hz with a stiffness of "
+            f"{squeeze.stiffness:g} N/m and a damping of {squeeze.damping:g} N s/m; want below {limit:.3g}"
+        )
+
+
+DRIVER = HandDriver

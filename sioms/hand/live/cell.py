@@ -1,0 +1,174 @@
+"""Carry out skills on a hand of a running workcell: the same generators as on a simulated plane.
+
+    with Workcell() as cell, CellHand(cell) as hand:
+        skills = Skills(hand.hand, hand.reading)
+        held = hand.run(skills.hold_parallel(5.0))
+
+With every publication of the hand's node the skill is sent a `Reading` and its `Setpoint` becomes a write of six
+commands (`sioms.hand.follow`).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import ExitStack
+from typing import Any, Self, TypeVar
+
+from sioms.client.node import AxisNode
+from sioms.client.stream import Stream
+from sioms.client.workcell import Workcell
+from sioms.hand.control import Gains
+from sioms.hand.felt import felt, internal_force
+from sioms.hand.follow import Follower, Order, standing
+from sioms.hand.kinematics import Hand, Six
+from sioms.hand.touch import Failed, Felt, Manner, Reading, Setpoint
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.records import AXIS_WRITE, WRITE
+
+T = TypeVar("T")
+FINGERS = ("touch1.shape", "touch2.shape")
+LEASE_S = 0.25
+_NAMES = list(WRITE[NodeClass.AXIS])
+_MODE, _VELOCITY, _FORCE = (_NAMES.index(name) for name in ("control_mode", "velocity", "force"))
+_JOG = int(ControlMode.VELOCITY)
+_PRESS = int(ControlMode.FORCE)
+_NEW_S = 1.0
+_BLIND = Felt(None)
+
+
+class CellHand:
+    """A hand of a running workcell, held for writing.
+
+    Args:
+        cell: the session.
+        name: of the hand's node.
+        fingers: nodes of what each finger feels.
+        hand: its modules.
+        gains: of the laws; the damper's are the driver's own.
+        length_m: of the contact along a finger.
+        lease_s: of the hand's node.
+
+    Attributes:
+        reading: the last one.
+        manner: how skills do it here: light touches are a little firmer than on the plane, because the platen holds
+            the object against one finger alone with up to 0.2 N.
+        seen: called with every reading and the set-point that answered it.
+
+    Raises:
+        OSError: a node that cannot be opened or read.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(
+        self, cell: Workcell, name: str = "hand", fingers: Sequence[str] = FINGERS, *, hand: Hand = Hand(),  # noqa: B008
+        gains: Gains = Gains(), length_m: float = 20e-3, lease_s: float = LEASE_S,  # noqa: B008
+    ) -> None:  # fmt: skip
+        self.hand, self.manner, self._length_m = hand, Manner(light_n=0.4), length_m
+        self._follower = Follower(gains)
+        self.seen: Callable[[Reading, Setpoint], None] | None = None
+        with ExitStack() as stack:
+            self._node: AxisNode = stack.enter_context(cell.open(name, "rw", 10.0, lease=lease_s))
+            self._fingers: list[Any] = [stack.enter_context(cell.open(f"{node}")) for node in fingers]
+            self._stream = Stream(self._node, ahead=8)
+            self._felt, self._stamps_ns = [_BLIND, _BLIND], [0, 0]
+            self._number, self._time_s = 0, 0.0
+            self._begin_ns = time.monotonic_ns()
+            self.reading = self._read()
+            self._stack = stack.pop_all()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Let go of the hand: it halts, and what it holds is held by whatever force there is."""
+        self._stack.close()
+
+    def run(self, ticks: Generator[Setpoint, Reading, T], most_s: float = 120.0) -> T:
+        """Carry out a skill to its end; return what it found.
+
+        Raises:
+            Failed: as the skill does; the hand stands.
+            OSError: the hand was stopped, is in fault, or is not there any more.
+            TimeoutError: it takes longer than `most_s`.
+        """
+        end = self.reading.time_s + most_s
+        try:
+            setpoint = next(ticks)
+            while self.reading.time_s < end:
+                setpoint = ticks.send(self.tick(setpoint))
+        except StopIteration as done:
+            self.keep()
+            found: T = done.value
+            return found
+        except Failed:
+            self.stop()
+            raise
+        self.stop()
+        raise TimeoutError(f"run skill: not done in {most_s:g} s")
+
+    def tick(self, setpoint: Setpoint) -> Reading:
+        """Have the set-point carried out; return the next reading."""
+        if setpoint.frozen:
+            self.stop()
+        else:
+            self._write(self._follower.orders(setpoint, self._at, self.force, self._sample_s))
+        self.reading = self._read()
+        if self.seen is not None:
+            self.seen(self.reading, setpoint)
+        return self.reading
+
+    def keep(self) -> None:
+        """Stand, and go on pressing as before."""
+        self._write(standing())
+        self._stream.drain()
+
+    def stop(self) -> None:
+        """Stop all motion."""
+        self._stream.drain()
+        self._node.stop()
+
+    @property
+    def coordinates(self) -> Six:
+        """The six coordinates at the last reading."""
+        return self._at
+
+    @property
+    def force(self) -> float:
+        """The internal force that both fingers tell [N], 0 while it is not known."""
+        return internal_force(*self.reading.fingers) or 0.0
+
+    def _write(self, orders: Sequence[Order]) -> None:
+        self._stream.write(b"".join([_record(*order) for order in orders]), replace=True)
+
+    def _read(self) -> Reading:
+        """Wait for the next publication of the hand; read what the fingers feel by then."""
+        shown = self._node.wait_new(self._number, _NEW_S)
+        self._number = shown.number
+        now_ns = time.monotonic_ns()
+        time_s = (now_ns - self._begin_ns) * 1e-9
+        self._sample_s = max(time_s - self._time_s, 1e-4)
+        self._time_s = time_s
+        at: Any = tuple(shown.position)
+        self._at: Six = at
+        for i, node in enumerate(self._fingers):
+            try:
+                frame = node.read()
+            except OSError:  # it is told by the age of its last frame
+                continue
+            self._stamps_ns[i] = frame.stamp_ns
+            self._felt[i] = felt(frame.data, self._length_m)
+        ages = [(now_ns - stamp_ns) * 1e-9 for stamp_ns in self._stamps_ns]
+        return Reading(
+            time_s, self.hand.inverse(self._at), (self._felt[0], self._felt[1]), (max(ages[0], 0.0), max(ages[1], 0.0))
+        )
+
+
+def _record(axis: int, presses: bool, value: float) -> bytes:
+    fields: list[Any] = [0] * len(_NAMES)
+    fields[0], fields[_MODE], fields[_FORCE if presses else _VELOCITY] = axis, _PRESS if presses else _JOG, value
+    return AXIS_WRITE.pack(*fields)
