@@ -50,6 +50,7 @@ COMMANDS: dict[str, Command] = {
     "metrics": Command("sioms.bridges.metrics", "serve values, states and alarms to Prometheus"),
     "epics": Command("sioms.bridges.epics", "show nodes to EPICS clients, and let them stop and move axes"),
     "mount": Command("sioms.bridges.mount.command", "show device nodes as files, for cat, echo, dd and every program"),
+    "ros2": Command("sioms.bridges.ros2", "publish axes, wrenches and diagnostics as ROS 2 topics over Zenoh"),
     "key": Command("sioms.gateway.command", "make, allow, list and revoke the keys of remote clients"),
     "cert": Command("sioms.gateway.cert_command", "make an authority, and certificates for gateways and clients"),
     "driver": Command("sioms.tools.driver", "list, check, trace and replay drivers"),

@@ -79,6 +79,7 @@ complete -c sioms -n __fish_use_subcommand -a serve -d 'let clients on other mac
 complete -c sioms -n __fish_use_subcommand -a metrics -d 'serve values, states and alarms to Prometheus'
 complete -c sioms -n __fish_use_subcommand -a epics -d 'show nodes to EPICS clients, and let them stop and move axes'
 complete -c sioms -n __fish_use_subcommand -a mount -d 'show device nodes as files, for cat, echo, dd and every program'
+complete -c sioms -n __fish_use_subcommand -a ros2 -d 'publish axes, wrenches and diagnostics as ROS 2 topics over Zenoh'
 complete -c sioms -n __fish_use_subcommand -a key -d 'make, allow, list and revoke the keys of remote clients'
 complete -c sioms -n __fish_use_subcommand -a cert -d 'make an authority, and certificates for gateways and clients'
 complete -c sioms -n __fish_use_subcommand -a driver -d 'list, check, trace and replay drivers'

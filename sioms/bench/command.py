@@ -31,6 +31,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     ),
     "pipe": ("pipes", "start of devin; devin piped into devout as a 1 kHz loop"),
     "reach": ("reach", "through a gateway: requests, readings, stops; what fails to axes halting"),
+    "fleet": ("fleet", "eight cells over Zenoh: stops, starts, reconnections, strangers"),
     "drivers": (
         "drivers",
         "drivers: cycle against the line's speed, streams without loss, stop on a busy line",

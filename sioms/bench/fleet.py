@@ -1,0 +1,251 @@
+"""Eight cells over Zenoh as one fleet: stops beside bare rounds of Zenoh, starts, reconnections, strangers. All on one
+machine, so that stamps of different cells can be compared.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import random
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+from typing import Any, Self
+
+import zenoh
+from zenoh.handlers import Callback
+
+from sioms.check import other_clock
+from sioms.check.daemon import Daemon
+from sioms.check.remote import Gateway, Relay, ZenohGateway
+from sioms.children import ends_with_us
+from sioms.client.command import command
+from sioms.client.fleet import Fleet
+from sioms.client.keys import VARIABLE
+from sioms.client.workcell import Workcell
+from sioms.client.zenoh_keys import config, endpoint
+
+from .figures import Bar, Report
+from .options import Options
+from .workcells import axes, workcell
+
+CELLS = 8
+SPEED = 0.02
+_ECHO = """
+import sys, time, zenoh
+from zenoh.handlers import Callback
+from sioms.client.keys import Folder
+from sioms.client.zenoh_keys import config, endpoint
+session = zenoh.open(config(Folder(sys.argv[1]), "listen", mode="router", listen={"endpoints": [sys.argv[2]]}))
+options = dict(congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.REAL_TIME, express=True)
+back = session.declare_publisher("bare/back", **options)
+there = session.declare_subscriber("bare/there", Callback(lambda sample: back.put(sample.payload), indirect=False))
+print("ready", flush=True)
+time.sleep(1e6)
+"""
+
+
+class BareRound:
+    """A put and a put back over Zenoh under TLS between two Python processes."""
+
+    def __init__(self, gateway: ZenohGateway, port: int) -> None:
+        place = endpoint("127.0.0.1", port)
+        self._process = subprocess.Popen(
+            [sys.executable, "-P", "-c", _ECHO, gateway.keys.path, place], stdout=subprocess.PIPE, text=True,
+            preexec_fn=ends_with_us(),
+        )  # fmt: skip
+        assert self._process.stdout is not None
+        self._process.stdout.readline()
+        connect = {"endpoints": [place], "timeout_ms": 5000, "exit_on_failure": True}
+        self._session = zenoh.open(config(gateway.own, "connect", mode="client", connect=connect))
+        self._came = threading.Semaphore(0)
+        self._subscriber = self._session.declare_subscriber("bare/back", Callback(self._back, indirect=False))
+        self._publisher = self._session.declare_publisher(
+            "bare/there",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            priority=zenoh.Priority.REAL_TIME,
+            express=True,
+        )
+        for _ in range(50):  # until each end knows of the other's
+            self._publisher.put(b"")
+            if self._came.acquire(timeout=0.2):
+                break
+        time.sleep(0.3)
+        while self._came.acquire(blocking=False):
+            pass
+
+    def _back(self, _: zenoh.Sample) -> None:
+        self._came.release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._session.close()  # type: ignore[no-untyped-call]
+        self._process.kill()
+        self._process.wait()
+
+    def time_ns(self) -> int:
+        """Return how long one takes [ns]."""
+        begin = time.perf_counter_ns()
+        self._publisher.put(bytes(100))
+        if not self._came.acquire(timeout=5.0):
+            raise TimeoutError("a bare round of Zenoh was lost")
+        return time.perf_counter_ns() - begin
+
+
+def bench_fleet(options: Options, report: Report) -> None:
+    """Stop, start and connect to eight cells over Zenoh; strangers at a gateway."""
+    with contextlib.ExitStack() as stack:
+        gateways: list[ZenohGateway] = []
+        for i in range(CELLS):
+            text = workcell([axes("mod0", 2, history=8192, limits=False)])
+            text = text.replace('name = "bench"', f'name = "cell{i}"').replace("realtime_priority = 50\n", "")
+            daemon = stack.enter_context(Daemon(text))
+            authority = gateways[0].authority if gateways else None
+            gateways.append(stack.enter_context(ZenohGateway(daemon.socket, authority=authority)))
+            report.progress(f"fleet: cell {i + 1} of {CELLS}")
+        own = gateways[0].own  # one certificate for all cells
+        for gateway in gateways[1:]:
+            gateway.keys.revoke(gateway.name)
+            gateway.keys.allow(gateway.name, gateways[0].number)
+        os.environ[VARIABLE] = own.path
+        time.sleep(0.3)
+        cells = {f"cell{i}": gateway.socket for i, gateway in enumerate(gateways)}
+        with Fleet(cells, "bench") as fleet:
+            _stops(options, report, fleet, gateways[0])
+            _starts(options, report, fleet)
+        _again(options, report, gateways[0])
+        _strangers(options, report, gateways[0])
+        _clocks(options, report, gateways[0])
+
+
+def _stops(options: Options, report: Report, fleet: Fleet, gateway: ZenohGateway) -> None:
+    """Stop all cells, and one; each stop follows as many bare rounds."""
+    from sioms.check.remote import free_ports
+
+    everywhere, slowest, one, bare = [], [], [], []
+    with BareRound(gateway, free_ports()) as rounds:
+        for trial in range(options.kills(30, 1000)):
+            bare += [rounds.time_ns() for _ in range(4)]
+            begin = time.monotonic_ns()
+            fleet.emergency_stop("bench")
+            everywhere.append(time.monotonic_ns() - begin)
+            slowest.append(max(status["stopped_ns"] for status in fleet.status().values()) - begin)
+            fleet.reset()
+            begin = time.monotonic_ns()
+            fleet["cell0"].emergency_stop_workcell("bench")
+            one.append(time.monotonic_ns() - begin)
+            fleet.reset()
+            report.progress(f"fleet: stop {trial}")
+    base = report.samples("bare round of Zenoh under TLS", bare)
+    report.samples("stop of one cell to acknowledgement", one, baseline=base)
+    report.samples(
+        f"stop of {CELLS} cells to the last acknowledgement", everywhere, "ms", baseline=base,
+        bars=[Bar("p50", 5.0), Bar("p99", 10.0)],
+    )  # fmt: skip
+    report.samples(f"stop of {CELLS} cells to the last latched", slowest, "ms")
+
+
+def _starts(options: Options, report: Report, fleet: Fleet) -> None:
+    """Let an axis of two cells begin to cruise at one instant; where they are afterwards says when they began."""
+    skews, stated = [], []
+    with fleet.open("cell0:mod0", "rw", lease=5.0) as one, fleet.open("cell1:mod0", "rw", lease=5.0) as two:
+        nodes = (one, two)
+        for trial in range(options.count(10, 300)):
+            begun = [node.read().commanded_position[0] for node in nodes]
+            for node in nodes:
+                node.write(command(0, velocity=SPEED, synch=True))
+            fleet.synch(*nodes, lead=0.5, within=1.0)
+            clocks: list[Any] = [fleet[name]._channel.clock for name in ("cell0", "cell1")]
+            stated.append(sum(clock.error_ns for clock in clocks))
+            time.sleep(0.75)
+            began = []
+            for node, place in zip(nodes, begun, strict=True):
+                seen = node.read()
+                began.append(seen.cell_stamp_ns - (seen.commanded_position[0] - place) / SPEED * 1e9)
+            skews.append(abs(int(began[0] - began[1])))
+            for node in nodes:
+                node.stop()
+            for node in nodes:
+                node.wait_until_idle(10.0)
+            report.progress(f"fleet: start {trial}")
+    report.samples("skew of a start of two cells", skews, bars=[Bar("p99", 100.0)])
+    report.samples("stated: how far apart they may be", stated)
+    outside = sum(skew > bound for skew, bound in zip(skews, stated, strict=True))
+    report.value("starts further apart than stated", outside, bars=[Bar("value", 0)], notes=f"of {len(skews)}")
+
+
+def _owned(pid: int) -> tuple[int, float]:
+    """Return descriptors and memory [MB] of a process."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return len(os.listdir(f"/proc/{pid}/fd")), pages * os.sysconf("SC_PAGESIZE") / 1e6
+
+
+def _again(options: Options, report: Report, gateway: ZenohGateway) -> None:
+    """Connect, hold something and leave, again and again."""
+    pids = {"gateway": gateway.process.pid, "client": os.getpid()}
+    before: dict[str, tuple[int, float]] = {}
+    trials, took = options.kills(60, 1000), []
+    for trial in range(trials + 20):
+        begin = time.perf_counter_ns()
+        with Workcell(gateway.socket, "again") as cell:
+            took.append(time.perf_counter_ns() - begin)
+            with cell.open("mod0", "rw", 2.0) as node:
+                node.read()
+        if trial == 19:
+            time.sleep(1.0)
+            before = {who: _owned(pid) for who, pid in pids.items()}
+        report.progress(f"fleet: connection {trial}")
+    time.sleep(1.0)
+    report.samples("connecting over Zenoh", took, "ms")
+    for who, pid in pids.items():
+        fds, megabytes = _owned(pid)
+        report.value(
+            f"{who}: descriptors more after {trials} connections", fds - before[who][0], bars=[Bar("value", 0)],
+            notes=f"memory {megabytes - before[who][1]:+.1f} MB",
+        )  # fmt: skip
+
+
+def _strangers(options: Options, report: Report, gateway: ZenohGateway) -> None:
+    """Send what is no TLS, broken TLS, and good TLS without a certificate."""
+    dice, sent, passed = random.Random(options.seed), 0, 0
+    context = ssl.create_default_context(cafile=gateway.own.file("authority.pem"))
+    connections = options.frames or options.count(300, 20_000)
+    for trial in range(connections):
+        with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", gateway.port), 2.0) as plain:
+            plain.settimeout(0.3)
+            if trial % 3 == 2:
+                with context.wrap_socket(plain, server_hostname="127.0.0.1") as sock:
+                    sock.sendall(b"\x0a\x00\x01" + dice.randbytes(40))
+                    sent += 1
+                    passed += bool(sock.recv(1))
+                continue
+            for _ in range(dice.randint(1, 8)):
+                head = b"\x16\x03\x01" if trial % 3 else dice.randbytes(2)
+                plain.sendall(head + dice.randbytes(dice.randint(1, 600)))
+                sent += 1
+            plain.recv(100)  # an alert of TLS, or nothing
+        report.progress(f"fleet: stranger {trial} of {connections}")
+    with Workcell(gateway.socket, "afterwards") as cell:
+        served = bool(cell.nodes())
+    report.value(
+        "frames of strangers that were answered by more than an alert", passed, bars=[Bar("value", 0)],
+        notes=f"of {sent} in {connections} connections; the gateway {'serves' if served else 'does not serve'} others",
+    )  # fmt: skip
+
+
+def _clocks(options: Options, report: Report, gateway: Gateway) -> None:
+    if not other_clock.available():
+        report.notes.append("no right to make a time namespace: clocks of two machines were not tried")
+        return
+    with Relay(gateway.port) as relay:
+        relay.jitter_s = 0.002
+        found: Any = other_clock.seen(gateway.trusted(relay.port), options.count(10, 1_000), 3600.0)
+    outside = sum(abs(off) > error for off, error in zip(found["off"], found["error"], strict=True))
+    report.samples("stated error of a stamp over a link of 0 to 2 ms each way", found["error"])
+    report.value("stamps outside of it", outside, bars=[Bar("value", 0)], notes=f"of {len(found['off'])}")
