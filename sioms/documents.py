@@ -9,6 +9,7 @@ Without input or output but for ``read_bytes``.
 from __future__ import annotations
 
 import json
+import math
 import tomllib
 from typing import TYPE_CHECKING, Any
 
@@ -65,6 +66,19 @@ def json_of(text: str | bytes) -> Any:
         raise ValueError(f"arrays or objects nested too deep; at most {DEEPEST} deep is right") from None
     _check(value, "", 0)
     return value
+
+
+def json_text(value: object) -> str:
+    """Return a value as JSON for people and programs; what is no number becomes null."""
+
+    def plain(value: Any) -> Any:
+        if isinstance(value, dict):
+            return {str(key): plain(inner) for key, inner in value.items()}
+        if isinstance(value, list | tuple):
+            return [plain(inner) for inner in value]
+        return None if isinstance(value, float) and not math.isfinite(value) else value
+
+    return json.dumps(plain(value), indent=1)
 
 
 def _text(text: str | bytes) -> str:

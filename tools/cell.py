@@ -144,17 +144,9 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 def print_json(value: object) -> None:
     """Print a value as JSON; what is no number becomes null."""
-    import json
-    import math
+    from sioms.documents import json_text
 
-    def plain(value: Any) -> Any:
-        if isinstance(value, dict):
-            return {str(key): plain(inner) for key, inner in value.items()}
-        if isinstance(value, list | tuple):
-            return [plain(inner) for inner in value]
-        return None if isinstance(value, float) and not math.isfinite(value) else value
-
-    print(json.dumps(plain(value), indent=1))
+    print(json_text(value))
 
 
 def info_fields(info: NodeInfo) -> dict[str, Any]:

@@ -17,6 +17,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     "update": ("reading", "publication to awake subscriber at 100 Hz and 1 kHz, on one processor"),
     "write": ("writing", "write to acknowledgement: 1, 16 and 10,000 commands"),
     "open": ("opening", "open and close, descriptors and memory gained by --soak N of them"),
+    "stale": ("stale", "readings older than what was acknowledged: --trials N requests in random order"),
     "race": ("opening", "two writers racing for one output"),
     "start": ("starting", "daemon start to ready, memory of daemon and drivers"),
     "restart": ("starting", "driver killed to its node back"),

@@ -11,6 +11,7 @@ from typing import Any
 
 from sioms.arguments import whole
 from sioms.client.keys import Folder
+from sioms.documents import json_text
 
 
 def add_parser(subparsers: Any) -> None:
@@ -35,7 +36,10 @@ def add_parser(subparsers: Any) -> None:
     sign.add_argument("--days", type=whole(1), default=365, help="how long it holds; default 365")
     install = verbs.add_parser("install", help="take a signed certificate for one's own")
     install.add_argument("file", help="what `sioms cert sign` has printed; - for standard input")
-    verbs.add_parser("list", help="list one's own certificate, and those that this machine's authority has signed")
+    listing = verbs.add_parser(
+        "list", help="list one's own certificate, and those that this machine's authority has signed"
+    )
+    listing.add_argument("--json", action="store_true", help="as JSON")
     for each in verbs.choices.values():
         each.add_argument("--keys", metavar="FOLDER", default="", help="of keys; default $SIOMS_KEYS or the user's own")
 
@@ -71,18 +75,23 @@ def run(args: argparse.Namespace) -> int:
             made = certificates.install(folder, _read(args.file))
             print(f"certificate {made.number} of {made.name}, until {made.ends:%Y-%m-%d}", file=sys.stderr)
         case "list":
-            _list(folder)
+            _list(folder, as_json=args.json)
     return 0
 
 
-def _list(folder: Folder) -> None:
+def _list(folder: Folder, *, as_json: bool) -> None:
     from sioms.client.certificates import CERTIFICATE, look_at, read
 
     from .certificates import issued
 
     path = folder.file(CERTIFICATE)
-    if os.path.exists(path):
-        own = look_at(read(path), f"read {path}")
+    own = look_at(read(path), f"read {path}") if os.path.exists(path) else None
+    if as_json:
+        mine = own and {"number": own.number, "name": own.name, "ends": f"{own.ends:%Y-%m-%d}", "hosts": own.hosts}
+        signed = [dict(zip(("number", "name", "ends"), words, strict=False)) for words in issued(folder)]
+        print(json_text({"own": mine, "signed": signed}))
+        return
+    if own:
         print(f"own     {own.number} {own.name} {own.ends:%Y-%m-%d} {','.join(own.hosts)}".rstrip())
     else:
         print("own     none; request one with: sioms cert request")

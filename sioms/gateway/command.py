@@ -7,11 +7,13 @@ import errno
 import getpass
 import ipaddress
 import sys
+from dataclasses import asdict
 from typing import Any
 
 from sioms.arguments import place
 from sioms.client.keys import Folder
 from sioms.client.places import place_of
+from sioms.documents import json_text
 from sioms.protocol.socketpath import socket_path
 
 PLACE, ZENOH_PLACE = "127.0.0.1:5770", "127.0.0.1:5780"
@@ -46,7 +48,10 @@ def add_parser(subparsers: Any) -> None:
     trust = verbs.add_parser("trust", help="take a public key for that of a gateway")
     trust.add_argument("address", help="zmq://HOST:PORT")
     trust.add_argument("public", metavar="KEY", help="the public key, of `sioms key list` on that machine")
-    verbs.add_parser("list", help="list one's own public key, who may come in, and which gateways are trusted")
+    listing = verbs.add_parser(
+        "list", help="list one's own public key, who may come in, and which gateways are trusted"
+    )
+    listing.add_argument("--json", action="store_true", help="as JSON")
     revoke = verbs.add_parser("revoke", help="let a key in no more, or forget a gateway; what it held halts")
     revoke.add_argument("name", help="of a key, or HOST:PORT of a gateway")
     for each in (serve, *verbs.choices.values()):
@@ -77,12 +82,23 @@ def run(args: argparse.Namespace) -> int:
             if not folder.distrust(args.name.removeprefix("zmq://")):
                 folder.revoke(args.name)
         case "list":
-            _list(folder)
+            _list(folder, as_json=args.json)
     return 0
 
 
-def _list(folder: Folder) -> None:
+def _list(folder: Folder, *, as_json: bool) -> None:
     own = folder.own()
+    if as_json:
+        print(
+            json_text(
+                {
+                    "own": {"name": own.name, "public": own.public} if own else None,
+                    "allowed": [asdict(one) for one in folder.allowed()],
+                    "trusted": [{"gateway": at, "public": key} for at, key in folder.trusted().items()],
+                }
+            )
+        )
+        return
     print(f"own      {own.name} {own.public}" if own else "own      none; make one with: sioms key new")
     for one in folder.allowed():
         print(f"allowed  {one.name} {one.public} {','.join(one.groups)}".rstrip())

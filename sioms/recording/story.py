@@ -27,6 +27,14 @@ def utc(stamp_ns: int) -> str:
     return f"{whole}.{stamp_ns % 1_000_000_000 // 1000:06d}Z"
 
 
+def happened(event: Event, offset_ns: int) -> dict[str, object]:
+    """Return an event as plain values; ``offset_ns`` is what UTC shows more than its clock."""
+    return {
+        "utc_ns": event.stamp_ns + offset_ns, "kind": event.kind, "source": event.source, "node": event.node,
+        "who": event.who, "errno": event.error, "text": sentence(event),
+    }  # fmt: skip
+
+
 def sentence(event: Event) -> str:
     """Return what an event tells, without its time."""
     return printable(_sentence(event), LONGEST)

@@ -49,6 +49,12 @@ def test_a_quick_bench_gives_ordered_percentiles_and_honest_bars(tmp_path: Path)
         assert found[name]["value"] == 0, (name, found[name]["notes"])
 
 
+def test_no_reading_is_older_than_what_was_acknowledged(tmp_path: Path) -> None:
+    found = {f["name"]: f for f in bench(tmp_path, "stale", "--trials", "80")}
+    assert found["interleavings in all"]["value"] == 80 and found["readings in all"]["value"] >= 80
+    assert found["stale readings"]["value"] == 0, found["stale readings"]["notes"]
+
+
 def test_two_writers_never_both_win(tmp_path: Path) -> None:
     figures = bench(tmp_path, "race")
     assert next(f for f in figures if f["name"] == "races without exactly one winner")["value"] == 0

@@ -1,7 +1,7 @@
 """Whatever the order of requests, readings, ticks and replies: no reading is older than what was acknowledged.
 
 The suite tries a few thousand orders; ``SIOMS_INTERLEAVINGS=1000000 pytest tests/properties/test_own_writes.py`` a
-million, with SIOMS_SEED=2 others.
+million, with SIOMS_SEED=2 others. ``sioms bench stale`` plays them on real processes, compiled and not.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from sioms.protocol.flags import AxisStatus, Request
 from sioms.protocol.markers import token_of
 from sioms.protocol.records import BINARY_WRITE
 
-STEPS = int(os.environ.get("SIOMS_INTERLEAVINGS", "6000")) // 4
+STEPS = int(os.environ.get("SIOMS_INTERLEAVINGS", "3000")) // 4
 pytestmark = pytest.mark.timeout(120 + STEPS // 100)
 STOPPED, STOPPING = int(AxisStatus.EMERGENCY_STOP), int(AxisStatus.STOPPING)
 WAITING_SYNCH, WAITING_MARKER = int(AxisStatus.WAITING_SYNCH), int(AxisStatus.WAITING_MARKER)

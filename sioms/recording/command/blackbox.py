@@ -14,10 +14,11 @@ from typing import Any
 
 from sioms.arguments import positive
 from sioms.client.workcell import Workcell
+from sioms.documents import json_text
 from sioms.recording.live.box import KEPT_S, Box
 from sioms.recording.live.recorder import Recorder, be_prompt
 from sioms.recording.reader import Recording
-from sioms.recording.story import sentence, tell, utc
+from sioms.recording.story import happened, sentence, tell, utc
 
 from .record import size
 
@@ -45,6 +46,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument(
         "--seconds", type=positive, default=KEPT_S, metavar="SECONDS", help="how much to keep (default: 60)"
     )
+    one.add_argument("--json", action="store_true", help="tell it as JSON")
     one.add_argument(
         "-a", "--all", action="store_true", help="tell all that happened, not only what belongs to the trouble"
     )
@@ -64,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
         if not boxes:
             raise OSError(errno.ENOENT, f"no black box in {folder}; `sioms blackbox --keep` writes them")
         path = str(boxes[-1])
-    return _tell(path, everything=args.all)
+    return _tell(path, everything=args.all, as_json=args.json)
 
 
 def _usual() -> str:
@@ -74,11 +76,21 @@ def _usual() -> str:
     return os.path.join(state, "sioms", "blackbox")
 
 
-def _tell(path: str, *, everything: bool) -> int:
+def _tell(path: str, *, everything: bool, as_json: bool) -> int:
     with Recording(path) as recording:
         events = recording.events()
         story = tell(events)
         zero = story.first.stamp_ns if story.first is not None else (events[0].stamp_ns if events else 0)
+        if as_json:
+            first, offset = story.first, recording.offset_ns
+            found = {
+                "file": path, "about": recording.about, "cause": story.cause if first else None, "text": story.text,
+                "begin_ns": first.stamp_ns + offset if first else None,
+                "events": [happened(event, offset) for event in (events if everything else story.events)],
+                "damage": recording.damage,
+            }  # fmt: skip
+            print(json_text(found))
+            return 1 if recording.damage else 0
         print(f"{path}: workcell {recording.about.get('workcell', '?')} on {recording.about.get('host', '?')}")
         if story.first is not None:
             print(f"Cause: {story.cause}, at {utc(zero + recording.offset_ns)}: {story.text}.")

@@ -10,9 +10,11 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from sioms.documents import json_text
+from sioms.recording.messages import Event
 from sioms.recording.reader import Recording
 from sioms.recording.rewrite import rewrite
-from sioms.recording.story import sentence, utc
+from sioms.recording.story import happened, sentence, utc
 from sioms.recording.tables import FORMATS, columns_of, export, head_of, main_column
 
 
@@ -23,6 +25,7 @@ def add_parser(subparsers: Any) -> None:
     one = actions.add_parser("info", help="print what is in a recording, and what is lost")
     one.add_argument("file", metavar="FILE")
     one.add_argument("-e", "--events", action="store_true", help="print all that happened, in order")
+    one.add_argument("--json", action="store_true", help="as JSON")
     one = actions.add_parser("plot", help="plot nodes over time")
     one.add_argument("file", metavar="FILE")
     one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all)")
@@ -56,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     """Run an action; return the exit status: 1 if something of a recording was lost."""
     match args.action:
         case "info":
-            lost = _info(args.file, args.events)
+            lost = _info_json(args.file, args.events) if args.json else _info(args.file, args.events)
         case "plot":
             lost = _plot(args)
         case "export":
@@ -104,11 +107,7 @@ def _info(path: str, with_events: bool) -> list[str]:
         print(f"{utc(first)} to {utc(last)}: {(last - first) / 1e9:.3f} s" if last else "nothing was recorded, or left")
         events = recording.events()
         print(f"{len(events)} events")
-        gaps: dict[str, int] = {}
-        for event in events:
-            if event.source == "recorder" and event.kind == "lost":
-                lacks = (event.data or {}).get("snapshots", 0)
-                gaps[event.node] = gaps.get(event.node, 0) + (lacks if isinstance(lacks, int) else 0)
+        gaps = _gaps(events)
         for name, node in recording.nodes.items():
             channels = ", ".join(f"{c.name} [{c.unit}]" if c.unit else c.name for c in node.info.channels)
             missing = f", {gaps[name]} lost" if gaps.get(name) else ""
@@ -118,6 +117,39 @@ def _info(path: str, with_events: bool) -> list[str]:
             for event in events:
                 print(f"{utc(event.stamp_ns + recording.offset_ns)[11:]}  {sentence(event)}")
     return lost
+
+
+def _info_json(path: str, with_events: bool) -> list[str]:
+    with Recording(path) as recording:
+        first, last, counts = recording.span()
+        lost, events = list(recording.damage), recording.events()
+        gaps = _gaps(events)
+        nodes = [
+            {
+                "name": name, "class": node.info.node_class.name.lower(), "snapshots": counts.get(node.channel, 0),
+                "lost": gaps.get(name, 0),
+                "channels": [{"name": c.name, "unit": c.unit} for c in node.info.channels],
+            }
+            for name, node in recording.nodes.items()
+        ]  # fmt: skip
+        found: dict[str, object] = {
+            "file": path, "bytes": recording.size, "packed": recording.is_packed, "about": recording.about,
+            "begin_ns": first, "end_ns": last, "nodes": nodes, "event_count": len(events), "damage": lost,
+        }  # fmt: skip
+        if with_events:
+            found["events"] = [happened(event, recording.offset_ns) for event in events]
+    print(json_text(found))
+    return lost
+
+
+def _gaps(events: Iterable[Event]) -> dict[str, int]:
+    """Return how many snapshots the recorder itself missed, by node."""
+    gaps: dict[str, int] = {}
+    for event in events:
+        if event.source == "recorder" and event.kind == "lost":
+            lacks = (event.data or {}).get("snapshots", 0)
+            gaps[event.node] = gaps.get(event.node, 0) + (lacks if isinstance(lacks, int) else 0)
+    return gaps
 
 
 def _plot(args: argparse.Namespace) -> list[str]:
