@@ -165,6 +165,8 @@ class WorkcellVerbs(Generic[M]):
         self.name, self.rights = "", 0
         self._request: StopRequest | None = None
         self._nodes: dict[int, NodeVerbs[Any]] = {}
+        self._drivers: dict[int, int] = {}
+        """Processes that halt what a node owns before its close is answered, as far as they are known."""
         self._fellows: list[Channel] = []
         self._beat_s = 0.0
 
@@ -240,6 +242,7 @@ class WorkcellVerbs(Generic[M]):
             lease = 0.0 if core[0].read_only else lease or REMOTE_LEASE_S
         node = self._NODES[core[0].node_class](core, self, self._waiter_of(core[-1]), lease)
         self._nodes[node.handle] = node
+        self._drivers[node.handle] = core[-1].server
         if self._channel.clock is not None:
             self._live_together(node, lease)
         if kind is not None and not isinstance(node, kind):
@@ -264,8 +267,9 @@ class WorkcellVerbs(Generic[M]):
     async def _closed_handle(self, handle: int) -> None:
         """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
         self._nodes.pop(handle, None)
+        driver = self._drivers.pop(handle, 0)
         try:
-            await self._ask("close", verbs.Close(handle))
+            await self._waiter.call(Call("close", verbs.Close(handle), through=driver))
         except OSError as error:
             # The session has ended, the daemon has gone, or knows no such handle any more: the driver has halted the
             # axes at the end of file of the node's own socket either way.

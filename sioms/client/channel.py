@@ -70,13 +70,14 @@ class Call:
         ahead: records that are sent ahead of it, in parts.
         limit_s: the time-out that the other side has been given [s], None = it may take for ever.
         enough: tells of an overdue answer whether it is not needed any more.
+        through: the process that has to act before it can be answered, beside the one that answers; 0: none.
 
     Raises:
         TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken
             client.
     """
 
-    __slots__ = ("ahead", "enough", "limit_s", "message", "what")
+    __slots__ = ("ahead", "enough", "limit_s", "message", "through", "what")
 
     def __init__(
         self,
@@ -86,8 +87,10 @@ class Call:
         ahead: tuple[bytes, ...] = (),
         limit_s: float | None = 0.0,
         enough: Callable[[], bool] | None = None,
+        through: int = 0,
     ) -> None:
         self.what = what
+        self.through = through
         self.message = checked(what, message)
         self.ahead = ahead
         self.limit_s = seconds(what, limit_s)
@@ -511,15 +514,18 @@ class Channel:
         """
         from .overdue import Overdue
 
+        return Overdue(self.server, due_s, call.enough, through=call.through)
+
+    @property
+    def server(self) -> int:
+        """The process that answers, as far as its number is one of this machine; 0: not known."""
         try:
             maker = unpack("3i", self._sock.getsockopt(SOL_SOCKET, SO_PEERCRED, 12))[0]
         except OSError:  # closed meanwhile
             maker = 0
-        if self._behind:
-            known, pid = self._behind
-            # Elsewhere processes have other numbers than here.
-            return Overdue(pid if known == maker else 0, due_s, call.enough)
-        return Overdue(maker if maker != os.getpid() else 0, due_s, call.enough)
+        known, pid = self._behind or (maker, maker)
+        # Elsewhere processes have other numbers than here.
+        return int(pid) if known == maker and pid != os.getpid() else 0
 
     def late(self, call: Call) -> OSError:
         """Return the error of a request that nobody has answered in time."""

@@ -46,12 +46,13 @@ class Overdue:
 
     Args:
         pid: the process that owes the answer, 0 when nobody knows: then GRACE_S is all it gets.
+        through: one that it waits for, 0: none; whether that gets on counts as well, unless the first is stopped.
         due_s: the moment of its time-out [s, time.monotonic].
         enough: tells whether the answer is not needed any more; it is asked at each look.
         look: as look_at.
     """
 
-    __slots__ = ("_due_s", "_enough", "_look", "_pid", "_progress_s", "_seen")
+    __slots__ = ("_due_s", "_enough", "_look", "_pids", "_progress_s", "_seen")
 
     def __init__(
         self,
@@ -59,13 +60,15 @@ class Overdue:
         due_s: float,
         enough: Callable[[], bool] | None = None,
         look: Callable[[int], Seen] = look_at,
+        *,
+        through: int = 0,
     ) -> None:
-        self._pid = pid
+        self._pids = [each for each in (pid, through) if each] if pid else []
         self._due_s = due_s + GRACE_S
         self._progress_s = due_s
         self._enough = enough
         self._look = look
-        self._seen: Seen | None = None
+        self._seen: dict[int, Seen] = {}
 
     def until(self, now_s: float) -> float:
         """Look at the process; return how long to wait before the next look [s, time.monotonic], 0: no longer."""
@@ -79,14 +82,18 @@ class Overdue:
         return min(until_s, look_s if self._enough is not None else max(look_s, self._due_s))
 
     def _alive_s(self, now_s: float) -> float:
-        """Return when the process last did something, or could not because others had the processors."""
-        try:
-            seen = self._look(self._pid) if self._pid else None
-        except (OSError, ValueError, IndexError):
-            seen = None
-        if seen is None or seen[0] in _STOPPED:
-            return 0.0
-        before, self._seen = self._seen, seen
-        if seen[0] in _GETS_ITS_TURN or (before is not None and before[1:] != seen[1:]):
-            self._progress_s = now_s
-        return self._progress_s
+        """Return when they last did something, or could not because others had the processors."""
+        alive_s = 0.0
+        for pid in self._pids:
+            try:
+                seen = self._look(pid)
+            except (OSError, ValueError, IndexError):
+                break
+            if seen[0] in _STOPPED:
+                break
+            before = self._seen.get(pid)
+            self._seen[pid] = seen
+            if seen[0] in _GETS_ITS_TURN or (before is not None and before[1:] != seen[1:]):
+                self._progress_s = now_s
+            alive_s = self._progress_s
+        return alive_s

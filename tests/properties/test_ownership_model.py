@@ -153,6 +153,24 @@ def test_a_stop_in_the_middle_of_the_reset_of_a_node_is_kept_or_undone_but_never
             assert _is_stopped(cell, device) or not stopped, place
 
 
+def test_what_could_not_be_reset_is_stopped_when_its_driver_starts_again() -> None:
+    with cells() as make, pytest.MonkeyPatch.context() as patch:
+        cell = make()
+        for action in [*begin("nobody owns anything"), ("stop_node", 1, 0), ("hear", 0)]:
+            cell.take(action)
+
+        def full(*_: Any) -> None:
+            raise BlockingIOError
+
+        patch.setattr(DriverProcess, "send", full)
+        assert cell.reset_node(2, 0) == "refused"
+        patch.undo()
+        assert _is_stopped(cell, 0)
+        for action in (("kill", 0), ("bury", 0, "process"), ("start", 0)):
+            cell.take(action)
+        assert _is_stopped(cell, 0)
+
+
 def _is_stopped(cell: Cell, device: int) -> bool:
     runtime = cell._process(device).runtime
     block = runtime.blocks[0]

@@ -106,3 +106,21 @@ def test_what_a_process_does_is_seen(child: Callable[[str], int]) -> None:
         os.sched_yield()
     with pytest.raises(OSError):
         look_at(2**22 + 1)
+
+
+def _together(first: Seen, other: Callable[[float], Seen]) -> float:
+    now_s = FIRST_LOOK_S
+    overdue = Overdue(7, 0.0, None, lambda pid: first if pid == 7 else other(now_s), through=8)
+    while until_s := overdue.until(now_s):
+        now_s = until_s
+    return now_s
+
+
+def test_one_that_waits_for_another_process_is_waited_for_while_that_gets_on() -> None:
+    """A daemon that closes a node sleeps until the driver, which may be in the run queue, has halted it."""
+    asleep = ("S", 5, 6)
+    assert _together(asleep, lambda _: ("R", 0, 0)) == MOST_S
+    assert _together(asleep, lambda s: ("S", int(s * 100), 0)) == MOST_S
+    assert _together(asleep, lambda _: asleep) == GRACE_S
+    assert _together(asleep, lambda _: ("T", 0, 0)) == GRACE_S
+    assert _together(("T", 5, 6), lambda _: ("R", 0, 0)) == GRACE_S, "one that is stopped answers nobody"

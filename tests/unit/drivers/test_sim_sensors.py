@@ -220,3 +220,18 @@ def test_a_late_force_sensor_makes_up_for_its_samples_with_what_pressed_at_the_t
     tick()
     overrun = [int(fields["flags"]) & AnalogStatus.OVERRUN != 0 for _, fields in bench.shown(block)[-129:]]
     assert overrun == [True] + 128 * [False], "what cannot be made up for is told"
+
+
+@pytest.mark.parametrize(("to", "lost"), [(0.06, 2), (0.0, 0)])
+def test_a_beam_that_missed_what_an_axis_did_counts_edges_as_lost_if_it_moved(bench, to, lost):
+    mod = bench.make(SimAxes, "mod0", {"axis": [AXIS], "history": 16})
+    boxes = [{"mod0.plant.x_position": [0.1, 0.2]}]
+    beams = bench.make(SimIo, "beams", {"inputs": 1, "beam": [{"bit": 0, "boxes": boxes}]})
+    bench.run(0.01)
+    plant = mod.blocks[1]
+    for at in np.linspace(0.0, to, 40):
+        bench.clock_ns += 1_000_000
+        plant.data[0] = at
+        bench._publish(plant, bench.clock_ns)
+    beams.tick(bench.clock_ns)
+    assert beams.blocks[0].edges[0] == lost and beams.blocks[0].data[0] == 0
