@@ -27,6 +27,7 @@ from .node_verbs import NodeVerbs
 from .quotas import Quotas, why_full
 from .rights import Peer, Rights
 from .sessions import LATER, Refused, Session, Wait, peer_of, pidfd_of
+from .supervision import Supervision
 from .users import Users
 from .workcell_verbs import WorkcellVerbs
 
@@ -62,6 +63,7 @@ class Clients:
         self.nodes = NodeVerbs(server, self)
         self.markers = MarkerVerbs(server.shared.markers, self)
         self._workcell = WorkcellVerbs(server, self)
+        self.supervision = Supervision(server.loop, lambda: self.bounds.supervisor_lease_s, server.stop_workcell)
         listener.setblocking(False)
 
     @property
@@ -260,6 +262,8 @@ class Clients:
                 return self._workcell.emergency_stop(session, message)
             case verbs.Reset():
                 return self._workcell.reset(session, message)
+            case verbs.Supervise():
+                return self._workcell.supervise(session, message)
             case verbs.Alarms():
                 return self._workcell.alarms(session)
             case verbs.Acknowledge():
@@ -299,6 +303,7 @@ class Clients:
             self._server.log("warning", "session ended", peer=session, why=why)
         self._server.loop.turns.remove(session.sock.fileno())
         session.sock.close()
+        self.supervision.end_session(session)  # first: it may stop the workcell
         for wait in list(session.waits.values()):
             self.drop(wait)
         self.markers.end_session(session)

@@ -35,6 +35,7 @@ class WorkcellTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     gateway_user: str = ""
     start_stopped: bool = False
     daemon_lease_s: Seconds = 0.5
+    supervisor_lease_s: Annotated[float, Meta(ge=0.0, le=3600.0)] = 0.0
     max_sessions: Count = 256
     state_folder: str = ""
 

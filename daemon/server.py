@@ -434,6 +434,7 @@ class Server:
             self.log("warning", "does not fit", why=shortage)
         if first and plan.config.workcell.start_stopped:
             self.stop_workcell("started stopped, as configured")
+        self.clients.supervision.take_up()
         for name, device in list(self.devices.items()):
             wanted = plan.config.devices.get(name)
             same = wanted == device.device and plan.names.devices[name].facts() == device.info.facts()

@@ -23,7 +23,7 @@ from .rights import Peer
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
-    from sioms.protocol.verbs import Acknowledge, EmergencyStop, Hello, Reload, Report, Represent, Reset
+    from sioms.protocol.verbs import Acknowledge, EmergencyStop, Hello, Reload, Report, Represent, Reset, Supervise
 
     from .clients import Clients
     from .server import Server
@@ -196,12 +196,22 @@ class WorkcellVerbs:
         except OSError as error:
             raise Refused(errno.EIO, f"emergency stop of {name}: {error.strerror}") from None
 
+    def supervise(self, session: Session, message: Supervise) -> float:
+        """Take a session for a supervisor of the workcell."""
+        if not self._clients.rights.on_workcell(session.peer) & message.right:
+            raise Refused(errno.EPERM, f"supervise: {session.peer.user} has no right to stop; ask for a [[grant]]")
+        if not message.lease_s > 0:
+            raise Refused(errno.EINVAL, f"supervise: lease {message.lease_s:g} s; want more than 0")
+        return self._clients.supervision.renew(session, message.lease_s)
+
     def reset(self, session: Session, message: Reset) -> None:
         """Reset the workcell, or a node, or the fault of its device."""
         (name,) = message
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
+            if self._clients.supervision.missing:
+                raise Refused(errno.EPERM, "reset: the workcell has no supervisor; start `sioms supervise`")
             if source := self._server.hear_request():
                 raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
             self._server.reset_workcell(str(session))

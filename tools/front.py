@@ -38,6 +38,7 @@ COMMANDS: dict[str, Command] = {
     "monitor": Command("sioms.tools.monitor", "display all nodes live; stop, reset and jog by key"),
     "stop": Command("sioms.tools.cell", "emergency stop of a node or of the whole workcell"),
     "reset": Command("sioms.tools.cell", "clear a latched stop or fault"),
+    "supervise": Command("sioms.tools.supervise", "be the supervisor without whom the cells of a fleet stop"),
     "reload": Command("sioms.tools.cell", "make the daemon reload its configuration"),
     "alarms": Command("sioms.tools.alarms", "list alarms; acknowledge them"),
     "record": Command("sioms.recording.command.record", "record everything that nodes publish and are told"),

@@ -33,7 +33,7 @@ _sioms_driver() {
 _sioms() {
     local word=${COMP_WORDS[COMP_CWORD]}
     if ((COMP_CWORD == 1)); then
-        mapfile -t COMPREPLY < <(compgen -W 'demo init list info status wait monitor stop reset reload alarms record log replay blackbox check service serve metrics epics mount ros2 key cert driver bench hand tactile reconcile --help --version' -- "$word")
+        mapfile -t COMPREPLY < <(compgen -W 'demo init list info status wait monitor stop reset supervise reload alarms record log replay blackbox check service serve metrics epics mount ros2 key cert driver bench hand tactile reconcile --help --version' -- "$word")
         return
     fi
     case ${COMP_WORDS[1]} in

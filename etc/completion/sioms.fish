@@ -67,6 +67,7 @@ complete -c sioms -n __fish_use_subcommand -a wait -d 'wait until the daemon is 
 complete -c sioms -n __fish_use_subcommand -a monitor -d 'display all nodes live; stop, reset and jog by key'
 complete -c sioms -n __fish_use_subcommand -a stop -d 'emergency stop of a node or of the whole workcell'
 complete -c sioms -n __fish_use_subcommand -a reset -d 'clear a latched stop or fault'
+complete -c sioms -n __fish_use_subcommand -a supervise -d 'be the supervisor without whom the cells of a fleet stop'
 complete -c sioms -n __fish_use_subcommand -a reload -d 'make the daemon reload its configuration'
 complete -c sioms -n __fish_use_subcommand -a alarms -d 'list alarms; acknowledge them'
 complete -c sioms -n __fish_use_subcommand -a record -d 'record everything that nodes publish and are told'

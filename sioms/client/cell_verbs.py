@@ -446,6 +446,19 @@ class WorkcellVerbs(Generic[M]):
         """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""
         await self._ask("reset", verbs.Reset(node))
 
+    @verb
+    async def supervise(self, lease: float) -> float:
+        """Supervise the workcell for a while: where its configuration asks for a supervisor, it is stopped when the
+        last one ends its session, or is silent for longer than the lease.
+
+        Args:
+            lease: until when that holds at most [s]; call again before, a few times in each lease.
+
+        Returns:
+            How long a supervisor may be silent there [s]; 0 = the workcell asks for none.
+        """
+        return float(await self._ask("supervise", verbs.Supervise(as_number("supervise: lease", lease, "seconds"))))
+
     # --- alarms ----------------------------------------------------------------------------------
 
     @verb

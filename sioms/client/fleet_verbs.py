@@ -310,6 +310,12 @@ class FleetVerbs(Generic[C]):
         """Clear the latched stops of all cells. Nothing resumes by itself."""
         await self._ask("reset", lambda _: verbs.Reset(""))
 
+    @verb
+    async def supervise(self, lease: float) -> dict[str, float]:
+        """Supervise every cell for a while; see ``Workcell.supervise``. Returns the lease of each cell by its name."""
+        lease_s = as_number("supervise: lease", lease, "seconds")
+        return dict(await self._ask("supervise", lambda _: verbs.Supervise(lease_s)))
+
     # --- together --------------------------------------------------------------------------------
 
     @verb

@@ -132,7 +132,7 @@ class Gateway:
             case Up.PACKET if channel:
                 self._to_driver(session, channel, stamp_ns, body, now_ns)
             case Up.PACKET:
-                self._to_daemon(session, body)
+                self._to_daemon(session, body, now_ns - stamp_ns)
             case Up.CREDIT if channel & link.JOURNAL:
                 for followed in session.followed.values():
                     if followed.channel == channel:
@@ -167,12 +167,12 @@ class Gateway:
         except OSError:
             self.driver_gone(session, handle)
 
-    def _to_daemon(self, session: Session, packet: bytes) -> None:
+    def _to_daemon(self, session: Session, packet: bytes, age_ns: int) -> None:
         number, message = verbs.take(packet, verbs.FROM_CLIENT)
         if number >= OWN_NUMBERS or isinstance(message, verbs.Represent):
             raise MalformedMessage("that is the gateway's to say")
         if session.taken_in:
-            self._pass(session, number, message, packet)
+            self._pass(session, number, message, packet, age_ns)
             return
         session.waiting.append(packet)
         if len(session.waiting) > MOST_WAITING:
@@ -185,7 +185,14 @@ class Gateway:
             except OSError as error:
                 self._refuse_waiting(session, error.errno or errno.EIO, error.strerror or str(error))
 
-    def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes) -> None:
+    def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes, age_ns: int = 0) -> None:
+        if isinstance(message, verbs.Supervise):  # from when its client was last told the time, as any lease
+            left_s = message.lease_s - age_ns / 1e9
+            if left_s <= 0:
+                text = f"supervise: the link is late by more than the lease of {message.lease_s:g} s"
+                self._send(session, Down.PACKET, body=refusal(number, errno.ETIMEDOUT, text))
+                return
+            packet = verbs.Supervise(left_s).packed(number)
         if isinstance(message, verbs.Journal):
             session.asks[number] = message.device
         if isinstance(message, verbs.Cancel) and self._cancelled(session, number, message.number):

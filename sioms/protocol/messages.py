@@ -86,6 +86,7 @@ class ClientVerb(IntEnum):
     RELOAD = 22
     ALARMS = 23
     ACKNOWLEDGE = 24
+    SUPERVISE = 25
     CANCEL = 30
 
 

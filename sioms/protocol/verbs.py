@@ -315,6 +315,14 @@ class EmergencyStop(
     why: Text
 
 
+class Supervise(Message, on=FROM_CLIENT, verb=ClientVerb.SUPERVISE, right=Right.STOP):
+    """Supervise the workcell for a while; the right on any one node is sufficient. Answer: how long a supervisor may be
+    silent before the workcell is stopped [s], 0 = it asks for none.
+    """
+
+    lease_s: Number
+
+
 class Reset(
     Message, on=FROM_CLIENT, verb=ClientVerb.RESET, right=Right.WRITE | Right.ADMINISTER, shown=True
 ):  # fmt: skip

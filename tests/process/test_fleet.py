@@ -14,7 +14,8 @@ from daemon_rig import axes, daemons, raises, wait_for
 
 import sioms
 import sioms.aio
-from sioms.check.remote import Gateway, ZenohGateway
+from sioms.check.remote import Gateway, Relay, ZenohGateway
+from sioms.children import Process
 from sioms.tools.front import main
 
 
@@ -156,3 +157,37 @@ def test_the_asyncio_face(cells: dict[str, str]) -> None:
             await fleet.reset()
 
     asyncio.run(go())
+
+
+def test_a_cell_that_asks_for_a_supervisor_stops_without_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    text = _cell("guarded").replace('"guarded"\n', '"guarded"\nsupervisor_lease_s = 1.0\n')
+    with daemons() as start:
+        daemon = start(text)
+        with Gateway(daemon.socket) as gate, Relay(gate.port) as relay, daemon.cell() as cell:
+            assert "no supervisor: start" in cell.status()["stop_source"]
+            with raises(errno.EPERM, "has no supervisor"):
+                cell.reset()
+            file = tmp_path / "fleet.toml"
+            file.write_text(f'[cells]\nguarded = "{gate.trusted(relay.port)}"\n')
+            monkeypatch.setenv("SIOMS_FLEET", str(file))
+            supervisor = Process(["sioms.tools.front", "supervise"], "stops after 1 s", errors=True)
+            cell.reset()
+            time.sleep(1.5)
+            assert not cell.status()["stopped_ns"], "it lives"
+            relay.stalled = True
+            wait_for(lambda: cell.status()["stopped_ns"], "the stop after a stalled link")
+            assert "supervisor eva@127.0.0.1" in cell.status()["stop_source"]
+            relay.stalled = False
+            wait_for(lambda: _reset(cell), "a supervisor again")
+            supervisor.kill()
+            wait_for(lambda: cell.status()["stopped_ns"], "the stop after the supervisor's death")
+            with raises(errno.EPERM, "has no supervisor"):
+                cell.reset()
+
+
+def _reset(cell: sioms.Workcell) -> bool:
+    try:
+        cell.reset()
+    except OSError:
+        return False
+    return True

@@ -162,6 +162,7 @@ ON_NODES: dict[str, tuple[Callable[[Workcell, str], int | None], list[Right]]] =
 ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
     "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", ""), Right.STOP),
     "reset": (lambda c: c.ask("eva", ClientVerb.RESET, ""), EITHER),
+    "supervise": (lambda c: c.ask("eva", ClientVerb.SUPERVISE, 0.5), Right.STOP),
     "reload": (lambda c: c.ask("eva", ClientVerb.RELOAD), Right.ADMINISTER),
     "journal": (lambda c: c.ask("eva", ClientVerb.JOURNAL, ""), Right.ADMINISTER),
 }
@@ -191,6 +192,7 @@ def test_no_verb_is_left_out() -> None:
         ClientVerb.OPEN,
         ClientVerb.INFO,
         ClientVerb.EMERGENCY_STOP,
+        ClientVerb.SUPERVISE,
         ClientVerb.RESET,
         ClientVerb.ACKNOWLEDGE,
         ClientVerb.RELOAD,
@@ -221,7 +223,7 @@ def test_a_verb_on_the_workcell_takes_its_right_on_every_node(cell: Workcell, ri
     granted = Right(sum(RIGHTS[name] for name in rights))
     cell.grant((rights, "eva", pattern))
     for name, (ask, need) in ON_ALL.items():
-        may = bool(granted & need) and (pattern == "*" or name == "stop")
+        may = bool(granted & need) and (pattern == "*" or name in ("stop", "supervise"))
         assert ask(cell) == ((None if name == "reload" else 0) if may else errno.EPERM), name
     for verb, (arguments, answer) in ON_NOTHING.items():
         assert cell.ask("eva", verb, *arguments) == (answer if granted else errno.EPERM), verb
