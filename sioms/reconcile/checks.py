@@ -28,8 +28,8 @@ MISTAKES = {
 #: Measured may be so many times the commanded force; samples it is judged on, their share of the largest force, and
 #: seconds of a mean.
 FORCE_SCALE, LEAST_SLOW, SLOW_SHARE, SLOW_S = 1.33, 200, 0.8, 0.05
-#: Share of samples at the controller's limit above which nothing is left to learn.
-SATURATED = 0.5
+#: Share of samples at the controller's limit above which nothing is left to learn, and above which it is said.
+SATURATED, OFTEN = 0.9, 0.5
 
 
 def check(session: Session, model: AxisModel) -> tuple[str, ...]:
@@ -44,7 +44,7 @@ def check(session: Session, model: AxisModel) -> tuple[str, ...]:
     if not session.records:
         raise BadInputError("read records: there are none; give at least one recording of the axis")
     for r in session.records + session.final:
-        _check_record(r, model)
+        check_record(r, model)
     seconds = session.samples * model.sample_time_s
     if seconds < LEAST_TOTAL_S:
         raise BadInputError(
@@ -60,7 +60,12 @@ def check(session: Session, model: AxisModel) -> tuple[str, ...]:
     return tuple(_notes(session, model))
 
 
-def _check_record(r: Record, model: AxisModel) -> None:
+def check_record(r: Record, model: AxisModel) -> None:
+    """Check one record by itself.
+
+    Raises:
+        BadInputError: with what is wrong and what would be right.
+    """
     where = f"read record {r.name}"
     if len(r) < LEAST_SAMPLES:
         raise BadInputError(f"{where}: {len(r)} samples are too few; needs {LEAST_SAMPLES}")
@@ -101,7 +106,7 @@ def _check_record(r: Record, model: AxisModel) -> None:
             f"{where}: force reaches {top:.4g}, the controller's limit is {limit:.4g} {model.force_unit}; "
             f"{in_another_unit(top / limit)}"
         )
-    share = float(np.mean(np.abs(r.force) >= 0.999 * limit))
+    share = at_limit(r, model)
     if share > SATURATED:
         raise BadInputError(
             f"{where}: force is at its limit of {limit:.4g} {model.force_unit} in {100 * share:.0f} % of the "
@@ -109,6 +114,11 @@ def _check_record(r: Record, model: AxisModel) -> None:
         )
     if r.command is not None:
         _check_command(r, r.command, model)
+
+
+def at_limit(r: Record, model: AxisModel) -> float:
+    """Return the share of the samples at the limit of the controller; 0 where none is known."""
+    return 0.0 if model.controller is None else float(np.mean(np.abs(r.force) >= 0.999 * model.controller.limit))
 
 
 def in_another_unit(factor: float) -> str:
@@ -193,6 +203,8 @@ def _notes(session: Session, model: AxisModel) -> list[str]:
         out.append("no controller in the model: the closed loop is not simulated, gaps are given in force only")
     if model.controller is not None and any(r.command is None for r in session.records):
         out.append("no command recorded: the closed loop is not simulated, gaps are given in force only")
+    if often := [f"{r.name} {100 * at_limit(r, model):.0f} %" for r in session.records if at_limit(r, model) > OFTEN]:
+        out.append(f"the force is at the controller's limit most of the time ({', '.join(often)}): little shows there")
     if model.controller is not None:
         shares = [(r.name, beyond_feedback(r, model)) for r in session.records + session.final]
         if odd := [f"{name} {100 * share:.0f} %" for name, share in shares if share > FOREIGN]:

@@ -12,6 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from sioms.reconcile.checks import check_record
 from sioms.reconcile.controlled import FOREIGN, beyond_feedback
 from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
@@ -23,20 +24,49 @@ from sioms.reconcile.thresholds import JUMP_COUNTS, JUMP_TIMES, LAWLESS, NOISY, 
 SHIFTS = (*range(2, 31), 40, 50, 60, 80, 100)
 #: A law that holds only otherwise leaves at most this share of what it leaves as the columns are named.
 BETTER = 0.2
+#: Of the samples so many are in records that can be used; else none is.
+ENOUGH = 0.5
 
 
-def check_columns(session: Session, model: AxisModel) -> None:
-    """Check every record by itself.
+def usable(session: Session, model: AxisModel) -> tuple[Session, list[str]]:
+    """Check every record by itself, and leave out those that cannot be used where most can.
+
+    Returns:
+        The session of what can be used, and what is to be said of the rest.
 
     Raises:
-        BadInputError: with the record, what contradicts what, and what would be right.
+        BadInputError: too little can be used, or a final record cannot: with the record, what contradicts what, and
+            what would be right.
     """
-    for r in session.records + session.final:
-        where = f"read record {r.name}"
-        _check_rows(r, where)
-        _check_smooth(r, model, where)
-        _check_jumps(r, model, where)
-        _check_law(r, model, where)
+    for r in session.final:
+        check_one(r, model)
+    kept, refused = [], []
+    for r in session.records:
+        try:
+            check_one(r, model)
+            kept.append(r)
+        except BadInputError as e:
+            refused.append(e)
+    if not refused:
+        return session, []
+    if sum(map(len, kept)) < ENOUGH * session.samples:
+        raise refused[0]
+    notes = [f"left out, the others are used: {e}" for e in refused]
+    return replace(session, records=tuple(kept), continuous=False), notes
+
+
+def check_one(r: Record, model: AxisModel) -> None:
+    """Check a record by itself.
+
+    Raises:
+        BadInputError: it cannot be used.
+    """
+    check_record(r, model)
+    where = f"read record {r.name}"
+    _check_rows(r, where)
+    _check_smooth(r, model, where)
+    _check_jumps(r, model, where)
+    _check_law(r, model, where)
 
 
 def _check_rows(r: Record, where: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from sioms.reconcile.calibrate import calibrated
 from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check
-from sioms.reconcile.contradictions import check_columns, check_law
+from sioms.reconcile.contradictions import check_law, usable
 from sioms.reconcile.controlled import runs_the_loop
 from sioms.reconcile.effects import library
 from sioms.reconcile.experiment import Envelope
@@ -93,10 +93,11 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         BadInputError: the data cannot be used.
     """
     session, notes = on_grid(session, nominal.sample_time_s)
+    session, left_out = usable(session, nominal)
+    notes += left_out
     notes += check(session, nominal)
     if session.final:
         check(Session(session.final), nominal)
-    check_columns(session, nominal)
     if session.loop_time_s is not None:
         late = 0.5 * session.loop_time_s / nominal.sample_time_s
         if late < OWN_PACE:

@@ -191,7 +191,6 @@ KINDS: Mapping[str, Damage] = {
     "two rows of three lost": _rows(lambda n, rng: np.arange(0, n, 3)),
     "nine rows of ten lost": _rows(lambda n, rng: np.arange(0, n, 10)),
     "rows doubled": _rows(lambda n, rng: np.repeat(np.arange(n), 2)),
-    "rows doubled in one record": _rows(lambda n, rng: np.repeat(np.arange(n), 2), one=True),
     "rows tripled": _rows(lambda n, rng: np.repeat(np.arange(n), 3)),
     "a tenth of the rows lost": _rows(lambda n, rng: np.flatnonzero(rng.random(n) > 0.1)),
     "half of the rows lost": _rows(lambda n, rng: np.flatnonzero(rng.random(n) > 0.5)),

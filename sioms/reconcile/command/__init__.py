@@ -34,6 +34,13 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         of.add_argument("--quiet", action="store_true", help="no progress")
         group.add_argument("--yes", action="store_true", help="move without asking")
         group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
+    draft = kinds.add_parser(
+        "describe", help="look at records, draft columns.toml and nominal.toml, and ask for the rest"
+    )
+    draft.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings of a motor axis")
+    draft.add_argument(
+        "--out", type=Path, default=None, metavar="DIR", help="write both drafts there; they are new files"
+    )
     score = kinds.add_parser("score", help="solve a folder of fingers whose truth is known")
     score.add_argument("data", type=Path, metavar="PUBLIC", help="one folder for each finger")
     score.add_argument("truth", type=Path, metavar="TRUTH", help="NAME.json for each finger")
@@ -100,8 +107,10 @@ def run(args: argparse.Namespace) -> int:
     from sioms.lab.stopping import ExperimentStopped
     from sioms.reconcile.errors import BadInputError
 
-    say = (lambda text: None) if args.quiet else _progress
     try:
+        if args.subject == "describe":
+            return described(args.data, args.out)
+        say = (lambda text: None) if args.quiet else _progress
         return reconcile(args, SUBJECTS[args.subject], say)
     except BadInputError as e:
         print(f"bad input: {e}", file=sys.stderr)
@@ -131,6 +140,29 @@ def reconcile(args: argparse.Namespace, subject: Subject, say: Say) -> int:
     if node and args.install is not None:
         print(subject.install(args, verdict))
     return EXIT[verdict.outcome]
+
+
+def described(data: Path, out: Path | None) -> int:
+    """Print, or write, the drafts of both descriptions, and the questions.
+
+    Raises:
+        BadInputError: no file can be read, or a draft would replace a file.
+    """
+    from sioms.reconcile.errors import BadInputError
+    from sioms.reconcile.files.describe import describe
+
+    draft = describe(data)
+    drafts = {"columns.toml": draft.columns, "nominal.toml": draft.model}
+    if out is None:
+        print("\n".join(f"--- {name}\n{text}" for name, text in drafts.items()))
+    elif there := [name for name in drafts if (out / name).exists()]:
+        raise BadInputError(f"write drafts to {out}: {', '.join(there)} is there; needs a folder without it")
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, text in drafts.items():
+            (out / name).write_text(text, encoding="utf-8")
+    print("\n".join(["to be answered:", *(f"  {q}" for q in draft.questions)]) if draft.questions else "nothing to ask")
+    return 0
 
 
 def _live(args: argparse.Namespace, subject: Subject, say: Say) -> tuple[Any, float]:

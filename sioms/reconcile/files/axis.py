@@ -24,7 +24,6 @@ two when another has them.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -35,6 +34,7 @@ from numpy.typing import NDArray
 from sioms.documents import json_of
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.contents import contents
+from sioms.reconcile.files.describe import describe
 from sioms.reconcile.files.table import SUFFIXES, UNITS, load_table, measures, named, unit_of
 from sioms.reconcile.given import columns_in, number, only, parsed, table_in, truth, words
 from sioms.reconcile.model import AxisModel
@@ -42,15 +42,6 @@ from sioms.reconcile.model_file import model_from
 from sioms.reconcile.records import Record, Session
 
 Array = NDArray[np.float64]
-#: Words in the head of a column that tell what it probably is.
-WORDS = {
-    "time": ("t", "time", "zeit", "stamp"),
-    "position": ("pos", "position", "enc", "encoder", "angle", "actual", "q", "qm", "counts"),
-    "command": ("cmd", "command", "ref", "reference", "set", "setpoint", "target", "qg"),
-    "force_measured": ("current", "cur", "i", "iq", "measured"),
-    "force": ("force", "torque", "u", "effort", "out", "output", "tau"),
-    "index": ("index", "z", "mark"),
-}
 QUANTITIES = ("time", "position", "command", "force", "force_measured", "index", "feedforward", "external")
 #: Those which some files of a session may be without: there was none.
 SOMETIMES = ("feedforward", "external")
@@ -190,6 +181,8 @@ def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | N
             f"{where}: the description says {unit}, the head of the column {spec['name']!r} {stated}; which is it?"
         )
     kind, right = measures(unit), (ROTARY if model.rotary else LINEAR)[quantity]
+    if unit == "%" and "scale" not in spec and right in ("force", "torque"):
+        return np.asarray(raw * (model.rated_force / 100.0), dtype=np.float64)  # percent of rated, as drives say it
     if kind not in (right, "number", "count") and "scale" not in spec:
         hint = (
             "give scale = ..., what one unit of it is in SI units"
@@ -229,20 +222,11 @@ def _plain(files: Sequence[Path]) -> dict[str, Any] | None:
 
 
 def _draft(files: Sequence[Path], description: Path) -> str:
-    """Propose a column description from the heads of the first file, for a person to complete."""
-    table = load_table(files[0])
-    lines = ["[columns]"]
-    for head in table.columns:
-        name, unit = named(head)
-        unit = table.units.get(head, unit)
-        guess = next(
-            (q for q, words in WORDS.items() if any(w in re.split(r"[\W_]+", name.lower()) for w in words)),
-            "QUANTITY",
-        )
-        lines.append(f'{guess} = {{ name = "{head}", unit = "{unit or "UNIT"}" }}')
+    """Propose a column description from the first file, for a person to complete."""
+    columns = describe(files[0]).columns.replace("\n", "\n    ")
     return (
         f"write {description} with what each column is ({', '.join(QUANTITIES)}; position and force are needed, leave "
-        "out the others), for instance\n    " + "\n    ".join(lines)
+        f"out the others; sioms reconcile describe asks for the rest), for instance\n    {columns}"
     )
 
 

@@ -11,6 +11,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,17 +25,28 @@ from sioms.recording.tables import of_one_node
 
 Array = NDArray[np.float64]
 SUFFIXES = (".csv", ".npz", ".mat", ".txt", ".mcap")
+#: The pound-force in N, exactly (the pound times standard gravity).
+LBF = 0.45359237 * 9.80665
 #: Factors to SI, by what they measure.
 UNITS = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
-    "length": {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
-    "angle": {"rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180.0, "turn": 2.0 * np.pi},
-    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3},
-    "torque": {"N m": 1.0, "mN m": 1e-3, "kN m": 1e3, "N mm": 1e-3, "N cm": 1e-2},
+    "length": {
+        "m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "nm": 1e-9,
+        "in": 0.0254, "ft": 0.3048, "mil": 2.54e-5,
+    },
+    "angle": {
+        "rad": 1.0, "mrad": 1e-3, "deg": np.pi / 180.0, "turn": 2.0 * np.pi,
+        "arcmin": np.pi / 10800.0, "arcsec": np.pi / 648000.0,
+    },
+    "force": {"N": 1.0, "mN": 1e-3, "kN": 1e3, "lbf": LBF, "kip": 1e3 * LBF, "ozf": LBF / 16.0, "kgf": 9.80665},
+    "torque": {
+        "N m": 1.0, "mN m": 1e-3, "kN m": 1e3, "N mm": 1e-3, "N cm": 1e-2,
+        "lbf ft": 0.3048 * LBF, "lbf in": 0.0254 * LBF, "ozf in": 0.0254 * LBF / 16.0, "kgf cm": 0.0980665,
+    },
     "electric": {"V": 1.0, "mV": 1e-3, "A": 1.0, "mA": 1e-3, "%": 1.0},
     "number": {"1": 1.0},
-    "speed": dict.fromkeys(("m/s", "mm/s", "rad/s", "deg/s", "rpm", "1/min"), 1.0),
-}
+    "speed": dict.fromkeys(("m/s", "mm/s", "rad/s", "deg/s", "rpm", "1/min", "in/s", "ft/s", "rps"), 1.0),
+}  # fmt: skip
 #: Other spellings of the same units.
 SPELLINGS = {
     "°": "deg",
@@ -61,11 +73,41 @@ SPELLINGS = {
     "inc": "count",
     "ticks": "count",
     "U/min": "rpm",
+    "inch": "in",
+    "inches": "in",
+    '"': "in",
+    "feet": "ft",
+    "thou": "mil",
+    "lb": "lbf",
+    "lbs": "lbf",
+    "kips": "kip",
+    "oz": "ozf",
+    "kp": "kgf",
+    "lb ft": "lbf ft",
+    "lb-ft": "lbf ft",
+    "lbf-ft": "lbf ft",
+    "ft-lb": "lbf ft",
+    "ft lb": "lbf ft",
+    "ft-lbf": "lbf ft",
+    "lb in": "lbf in",
+    "lb-in": "lbf in",
+    "lbf-in": "lbf in",
+    "in-lb": "lbf in",
+    "in lb": "lbf in",
+    "oz-in": "ozf in",
+    "oz in": "ozf in",
+    "ozf-in": "ozf in",
+    "kgf-cm": "kgf cm",
+    "kg-cm": "kgf cm",
+    "percent": "%",
+    "pct": "%",
     "-": "1",
     "": "1",
 }
 #: Kinds of arrays that are columns.
 NUMBERS = "fiub"
+#: Columns of a matrix at most.
+WIDEST = 64
 #: Lines that may stand before the head.
 REMARKS = 60
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
@@ -124,13 +166,7 @@ def load_table(path: Path) -> Table:
             raw = read_npz(path) if path.suffix == ".npz" else read_mat(path)
         except UnreadableError as error:
             raise BadInputError(str(error)) from None
-        return _table(
-            {
-                k: np.asarray(v, dtype=np.float64)
-                for k, v in raw.items()
-                if np.ndim(v) == 1 and np.asarray(v).dtype.kind in NUMBERS
-            }
-        )
+        return _table(_flat({k: np.asarray(v) for k, v in raw.items()}))
     if path.suffix == ".mcap":
         try:
             _, columns = of_one_node(path, NodeClass.AXIS)
@@ -140,6 +176,22 @@ def load_table(path: Path) -> Table:
             ) from None
         return _table({head: np.asarray(values, dtype=np.float64) for head, values in columns.items()})
     return _text(path)
+
+
+def _flat(arrays: dict[str, NDArray[Any]]) -> dict[str, Array]:
+    """Return arrays of numbers as columns; those of a matrix as ``data(:,3)``, or ``data(3,:)`` where it lies down."""
+    out: dict[str, Array] = {}
+    for name, a in arrays.items():
+        if a.dtype.kind not in NUMBERS:
+            continue
+        if a.ndim == 1:
+            out[name] = np.asarray(a, dtype=np.float64)
+        elif a.ndim == 2 and min(a.shape) <= WIDEST:
+            upright = a.shape[0] >= a.shape[1]
+            for i, column in enumerate(a.T if upright else a, start=1):
+                head = f"{name}(:,{i})" if upright else f"{name}({i},:)"
+                out[head] = np.ascontiguousarray(column, dtype=np.float64)
+    return out
 
 
 def load_columns(path: Path) -> dict[str, Array]:

@@ -12,7 +12,7 @@ import pytest
 
 from sioms.reconcile.command import main
 from sioms.reconcile.command.damaged import COLUMNS, damaged, write
-from sioms.reconcile.contradictions import check_columns, check_law
+from sioms.reconcile.contradictions import check_law, usable
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.model import AxisModel
@@ -67,7 +67,7 @@ def test_records_that_agree_with_themselves_pass() -> None:
 )
 def test_a_contradiction_is_refused_with_its_reason(change: Change, said: str) -> None:
     with pytest.raises(BadInputError, match=said):
-        check_columns(every(change), given()[1])
+        usable(every(change), given()[1])
 
 
 @pytest.mark.parametrize(
@@ -100,6 +100,25 @@ def test_one_record_of_another_rate_is_found_among_the_others() -> None:
     odd = rows(lambda n: np.arange(0, n, 2))(bare[0])
     with pytest.raises(BadInputError, match="compare records"):
         prepare(replace(session, records=(odd, *bare[1:])), replace(model, controller=None), Options(pictures=False))
+
+
+def test_one_bad_record_is_left_out_and_two_of_three_are_too_many() -> None:
+    session, model = given()
+    doubled = rows(lambda n: np.repeat(np.arange(n), 2))
+    good, bad = session.records[0], doubled(session.records[1].cut(0, len(session.records[0]) // 4))
+    kept, notes = usable(replace(session, records=(good, bad)), model)
+    assert [r.name for r in kept.records] == [good.name] and not kept.continuous
+    assert "left out" in notes[0] and bad.name in notes[0] and "come twice" in notes[0]
+    with pytest.raises(BadInputError, match="come twice"):
+        usable(replace(session, records=(good, doubled(good), doubled(good))), model)
+    with pytest.raises(BadInputError, match="come twice"):  # a final record was chosen to be one
+        usable(replace(session, final=(bad,)), model)
+
+
+def test_a_force_that_takes_two_levels_is_no_saturation() -> None:
+    _, model = given()
+    open_loop = every(lambda r: replace(r, force=np.where(np.arange(len(r)) % 900 < 600, 1.0, 0.4), command=None))
+    usable(open_loop, replace(model, controller=None))
 
 
 def test_an_inertia_that_is_said_to_be_uncertain_may_be_any() -> None:

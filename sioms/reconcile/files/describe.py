@@ -1,0 +1,257 @@
+"""Look at a file of somebody's records and draft both descriptions: what each column seems to be, and what is asked.
+
+A column is taken for what its head says if its numbers agree; one without a telling head for what its numbers do beside
+the others. What is not certain stands as a question in the draft, which then cannot be used before it is answered.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.table import SUFFIXES, UNITS, Array, Table, load_table, measures, named
+
+#: Words in the head of a column that tell what it probably is.
+WORDS = {
+    "time": ("t", "time", "zeit", "stamp", "timestamp", "temps", "tiempo"),
+    "command": ("cmd", "command", "ref", "reference", "set", "setpoint", "target", "soll", "qg", "desired", "demand"),
+    "velocity": ("vel", "velocity", "speed", "v", "rpm", "omega", "dq", "qd"),
+    "position": ("pos", "position", "enc", "encoder", "angle", "actual", "ist", "q", "qm", "counts", "x", "y"),
+    "force_measured": ("current", "cur", "i", "iq", "measured", "strom"),
+    "force": ("force", "torque", "u", "effort", "out", "output", "tau", "moment", "voltage", "vir"),
+    "index": ("index", "z", "mark"),
+}
+#: Two columns say the same from this correlation on; one changes evenly where its steps vary by less than this share.
+SAME, EVEN = 0.98, 0.1
+#: A column of time steps of the log may vary by so much of one: polled, not sampled.
+POLLED = 0.5
+#: Rows that tell what a column is.
+FEWEST = 8
+#: An index mark passes in at most this share of the rows.
+RARE = 0.1
+NEEDED = ("position", "force")
+
+
+@dataclass(frozen=True, slots=True)
+class Guess:
+    """What a column seems to be.
+
+    Attributes:
+        quantity: of ``columns.toml``, or "velocity", which is not needed; None where nothing tells.
+        why: in words.
+    """
+
+    head: str
+    unit: str | None
+    quantity: str | None
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """Both descriptions, and what is to be answered before they can be used."""
+
+    columns: str
+    model: str
+    questions: tuple[str, ...]
+
+
+def describe(data: Path) -> Draft:
+    """Look at a file, or the first of a folder.
+
+    Raises:
+        BadInputError: there is none that can be read.
+    """
+    files = [data] if data.is_file() else sorted(p for p in data.glob("*") if p.suffix in SUFFIXES)
+    if not files:
+        raise BadInputError(f"describe {data}: no data files; expects one of {', '.join(SUFFIXES)}")
+    table = load_table(files[0])
+    table = Table({h: a for h, a in table.columns.items() if len(a) == _rows(table)}, table.units)
+    guesses = guessed(table)
+    step, said = _step(table, guesses)
+    questions = [*said, *_questions(guesses)]
+    model, asked = _model(table, guesses, step)
+    return Draft(_columns(guesses, step), model, (*questions, *asked))
+
+
+def _rows(table: Table) -> int:
+    """Rows that most columns have: constants and names may lie beside them."""
+    sizes = [len(a) for a in table.columns.values()]
+    return max(set(sizes), key=lambda n: (n > 1, sizes.count(n), n)) if sizes else 0
+
+
+def guessed(table: Table) -> list[Guess]:
+    """Say what every column seems to be, each quantity once."""
+    out: dict[str, Guess] = {}
+    taken: dict[str, str] = {}
+    for quantity in WORDS:
+        for head in table.columns:
+            if head not in out and quantity not in taken and quantity == _by_head(head, table):
+                unit = table.units.get(head, named(head)[1])
+                out[head] = Guess(head, unit, quantity, "by its head")
+                taken[quantity] = head
+    for head, values in table.columns.items():
+        if head not in out:
+            quantity, why = _by_numbers(values, table, taken)
+            out[head] = Guess(head, table.units.get(head, named(head)[1]), quantity, why)
+            if quantity is not None:
+                taken.setdefault(quantity, head)
+    return [out[head] for head in table.columns]
+
+
+def _by_head(head: str, table: Table) -> str | None:
+    """Return what the head says, where its unit and its numbers do not say otherwise."""
+    name, unit = named(head)
+    unit = table.units.get(head, unit)
+    words = [w for w in re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", name) if w]
+    found = next((q for w in words for q, known in WORDS.items() if w.lower() in known), None)
+    kind = measures(unit) if unit is not None else None
+    if kind == "speed":
+        return "velocity"
+    if kind in ("length", "angle") and found not in ("position", "command"):
+        return "position" if found is None else None
+    if kind in ("force", "torque") and found not in ("force", "force_measured"):
+        return "force" if found is None else None
+    if kind == "time" and found != "time":
+        return None
+    values = table.columns[head]
+    fits = {
+        "time": lambda: bool(np.all(np.diff(values[np.isfinite(values)]) >= 0.0)),
+        "index": lambda: len(np.unique(values)) <= 2,
+    }.get(found or "", lambda: float(np.ptp(values)) > 0.0)
+    return found if found is not None and fits() else None
+
+
+def _by_numbers(values: Array, table: Table, taken: Mapping[str, str]) -> tuple[str | None, str]:
+    """Return what the numbers of a column look like beside those that are known by now."""
+    steps = np.diff(values)
+    if len(values) < FEWEST:
+        return None, f"{len(values)} rows are too few to tell it by"
+    if not np.all(np.isfinite(values)):
+        return None, f"{int(np.sum(~np.isfinite(values)))} of its values are no numbers"
+    if np.ptp(values) == 0.0:
+        return None, f"constant at {values[0]:.6g}"
+    if "time" not in taken and np.all(steps > 0.0) and np.std(steps) < EVEN * np.mean(steps):
+        return "time", "it rises by even steps"
+    if "index" not in taken and np.array_equal(np.unique(values), (0.0, 1.0)) and np.mean(values) < RARE:
+        return "index", "it is 1 now and then"
+    for known in ("position", "force"):
+        if known not in taken:
+            continue
+        other = table.columns[taken[known]]
+        if np.array_equal(values, other):
+            return None, f"the same as {taken[known]}"
+        if known == "position" and abs(_alike(values[1:], np.diff(other))) > SAME:
+            return "velocity", f"it goes with the changes of {taken[known]}"
+        beside = {"position": "command", "force": "force_measured"}[known]
+        if beside not in taken and _alike(values, other) > SAME:
+            return beside, f"it goes with {taken[known]}"
+    if "position" not in taken and np.std(np.diff(values, 3)) < 0.05 * np.std(values):
+        return "position", "it changes smoothly"
+    return None, "nothing tells what it is"
+
+
+def _alike(a: Array, b: Array) -> float:
+    if np.std(a) == 0.0 or np.std(b) == 0.0:
+        return 0.0
+    return float(np.corrcoef(a, b)[0, 1])
+
+
+def _step(table: Table, guesses: list[Guess]) -> tuple[float | None, list[str]]:
+    """Return the time between rows in seconds, and what is to be said of it."""
+    found = next((g for g in guesses if g.quantity == "time"), None)
+    if found is None or len(table.columns[found.head]) < 2:
+        return None, ["what is the time between two rows (sample_time_s)? There is no column of time."]
+    steps = np.diff(table.columns[found.head])
+    typical = float(np.median(steps))
+    asked = []
+    if found.unit is None:
+        asked.append(f"in what unit is the time in {found.head!r} (steps of {typical:.6g})? Taken for seconds.")
+    if typical > 0.0 and np.mean(np.abs(steps - typical) > POLLED * typical) > 0.01:
+        low, high = np.quantile(steps, (0.05, 0.95))
+        asked.append(
+            f"are rows missing, or was the log polled? Steps of {found.head!r} go from {low:.4g} to {high:.4g}."
+        )
+    return typical * UNITS["time"].get(found.unit or "s", 1.0), asked
+
+
+def _questions(guesses: list[Guess]) -> list[str]:
+    got = {g.quantity for g in guesses}
+    out = [f"which column is the {q}? It is needed." for q in NEEDED if q not in got]
+    out += [
+        f"what is {g.head!r}? {g.why[0].upper()}{g.why[1:]}; it is left out." for g in guesses if g.quantity is None
+    ]
+    for g in guesses:
+        if g.unit is None and g.quantity in ("position", "command", "force", "force_measured"):
+            out.append(f"in what unit is {g.head!r}, which seems to be the {g.quantity} ({g.why})?")
+        elif g.unit is not None and measures(g.unit) == "electric" and g.unit != "%":
+            out.append(f"how many N or N m is one {g.unit} of {g.head!r} (scale)?")
+    return out
+
+
+def _columns(guesses: list[Guess], step: float | None) -> str:
+    lines = [] if step is not None else ["# sample_time_s = ?   # seconds between two rows"]
+    lines.append("[columns]")
+    for g in guesses:
+        head = g.head.replace("\\", "\\\\").replace('"', '\\"')
+        if g.quantity is None:
+            lines.append(f'# QUANTITY = {{ name = "{head}" }}   # left out: {g.why}')
+        elif g.quantity == "velocity":
+            lines.append(f'# not needed: "{head}", a speed ({g.why})')
+        else:
+            unit = f', unit = "{g.unit}"' if g.unit else ', unit = "?"' if g.quantity not in ("time", "index") else ""
+            scale = ", scale = 1.0" if g.unit and measures(g.unit) == "electric" and g.unit != "%" else ""
+            lines.append(f'{g.quantity} = {{ name = "{head}"{unit}{scale} }}   # {g.why}')
+    return "\n".join(lines) + "\n"
+
+
+def _model(table: Table, guesses: list[Guess], step: float | None) -> tuple[str, tuple[str, ...]]:
+    """Draft the model: what the records show, the rest as questions."""
+    by = {g.quantity: g for g in guesses if g.quantity is not None}
+    kinds = {measures(g.unit) for q in ("position", "force") if (g := by.get(q)) is not None and g.unit}
+    kind = "rotary" if kinds & {"angle", "torque"} else "linear" if kinds & {"length", "force"} else None
+    lines, asked = ["[axis]"], []
+
+    def line(key: str, value: object, text: str) -> None:
+        lines.append(f"{key} = {value}   # {text}" if value is not None else f"# {key} = ?   # {text}")
+        if value is None:
+            asked.append(f"{key}: {text}")
+
+    line("kind", f'"{kind}"' if kind else None, "rotary or linear, by the units" if kind else "rotary or linear?")
+    line("sample_time_s", f"{step:.9g}" if step else None, "time between two rows")
+    line("inertia", None, "kg or kg m^2, of the data sheet")
+    line("viscous", "0.0", "N s/m or N m s/rad; 0 where it is not known: it is then named")
+    line("pitch", None, "m or rad: lead of the screw or a turn; the period of what is periodic")
+    force, place = by.get("force"), by.get("position")
+    top = _si(table, force) if force is not None else None
+    line("rated_force", f"{top:.4g}" if top else None, "continuous force; here the largest in the record")
+    speed = _speed(table, place, step) if place is not None and step else None
+    line("max_speed", f"{speed:.4g}" if speed else None, "m/s or rad/s; here the largest in the record")
+    if place is not None and place.unit == "count":
+        line("resolution", None, "m or rad in a count")
+    return "\n".join(lines) + "\n", tuple(asked)
+
+
+def _factor(unit: str | None) -> float | None:
+    """Return what one of a unit is in SI; None where that is not known by itself."""
+    if unit is None or measures(unit) not in ("length", "angle", "force", "torque"):
+        return None
+    return UNITS[measures(unit)][unit]
+
+
+def _si(table: Table, g: Guess) -> float | None:
+    factor = _factor(g.unit)
+    return None if factor is None else float(np.nanmax(np.abs(table.columns[g.head]))) * factor
+
+
+def _speed(table: Table, g: Guess, step: float) -> float | None:
+    factor, n = _factor(g.unit), 5
+    x = table.columns[g.head]
+    if factor is None or len(x) <= n:
+        return None
+    return float(np.nanmax(np.abs(x[n:] - x[:-n]))) * factor / (n * step)
