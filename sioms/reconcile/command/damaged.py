@@ -76,7 +76,8 @@ def damaged(
     """
     rng = np.random.default_rng(seed)
     pairs = pool or [(_public(f"axis{i}", i, rng), _public(f"other{i}", i, rng)) for i in range(POOL)]
-    answers = []
+    answers: list[Answer] = []
+    read = 0
     with tempfile.TemporaryDirectory() as base:
         for i, (kind, damage) in enumerate(KINDS.items()):
             if only and kind not in only:
@@ -89,8 +90,12 @@ def damaged(
             a = answers[-1]
             said = f"{a.outcome}{': ' + ', '.join(a.names) if a.names else ''}"
             print(f"{'right' if a.right else 'WRONG'}  {kind}: {said} | {a.text[:160]} ({a.seconds:.0f} s)", flush=True)
+        for i, (one, _) in enumerate(pairs):
+            write(one, Path(base) / f"whole{i}")
+            read += _answer("undamaged", Path(base) / f"whole{i}", solve).outcome not in (ERROR, TRACEBACK)
     print(table(answers))
-    return 0 if all(a.right for a in answers) else 1
+    print(f"{'undamaged: read and judged':50s} {read} of {len(pairs)}")
+    return 0 if read == len(pairs) and all(a.right for a in answers) else 1
 
 
 def _public(name: str, turn: int, rng: np.random.Generator) -> Public:

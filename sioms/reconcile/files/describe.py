@@ -97,10 +97,10 @@ def guessed(table: Table) -> list[Guess]:
                 taken[quantity] = head
     for head, values in table.columns.items():
         if head not in out:
-            quantity, why = _by_numbers(values, table, taken)
-            out[head] = Guess(head, table.units.get(head, named(head)[1]), quantity, why)
-            if quantity is not None:
-                taken.setdefault(quantity, head)
+            seems, why = _by_numbers(values, table, taken)
+            out[head] = Guess(head, table.units.get(head, named(head)[1]), seems, why)
+            if seems is not None:
+                taken.setdefault(seems, head)
     return [out[head] for head in table.columns]
 
 
@@ -119,12 +119,14 @@ def _by_head(head: str, table: Table) -> str | None:
         return "force" if found is None else None
     if kind == "time" and found != "time":
         return None
-    values = table.columns[head]
-    fits = {
-        "time": lambda: bool(np.all(np.diff(values[np.isfinite(values)]) >= 0.0)),
-        "index": lambda: len(np.unique(values)) <= 2,
-    }.get(found or "", lambda: float(np.ptp(values)) > 0.0)
-    return found if found is not None and fits() else None
+    return found if found is not None and _fits(found, table.columns[head]) else None
+
+
+def _fits(quantity: str, values: Array) -> bool:
+    """Say whether a column may be what its head says."""
+    if quantity == "time":
+        return bool(np.all(np.diff(values[np.isfinite(values)]) >= 0.0))
+    return len(np.unique(values)) <= 2 if quantity == "index" else float(np.ptp(values)) > 0.0
 
 
 def _by_numbers(values: Array, table: Table, taken: Mapping[str, str]) -> tuple[str | None, str]:
