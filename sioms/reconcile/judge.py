@@ -22,7 +22,9 @@ from sioms.reconcile.verdict import Gap
 
 FORCE_LOOP = "force, closed loop"
 #: Speeds and places at which the power of what opposes motion is looked at.
-SPEEDS, PLACES = 41, 15
+SPEEDS, PLACES = 40, 15
+#: Less of the speed the other way is motion one way.
+ONE_WAY = 0.1
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,6 +92,8 @@ def _impossible(problem: Problem, model: AxisModel, free: Sequence[Freely]) -> l
 def power_given(problem: Problem, model: AxisModel) -> float:
     """Return the largest power that what depends on speed gives the axis, at speeds that it had; of the rated force's
     at the largest of them.
+
+    Where it moved both ways, both count together: what drives it one way and brakes it the other gives nothing.
     """
     dt = model.sample_time_s
     size = max(round(0.02 / dt), 1)
@@ -100,8 +104,10 @@ def power_given(problem: Problem, model: AxisModel) -> float:
         return 0.0
     every = np.concatenate(speeds)
     low, high = np.quantile(every, (0.01, 0.99))
-    v = np.linspace(float(low), float(high), SPEEDS)
-    v = v[np.abs(v) > 1e-3 * np.max(np.abs(v))]
+    both = min(-low, high) > ONE_WAY * max(-low, high)
+    top = max(-low, high)
+    v = np.linspace(-top, top, SPEEDS) if both else np.linspace(float(low), float(high), SPEEDS)
+    v = v[np.abs(v) > 1e-3 * top]
     if not len(v):
         return 0.0
     places = np.quantile(np.concatenate([r.position for r in problem.session.records]), np.linspace(0.05, 0.95, PLACES))
@@ -118,4 +124,5 @@ def power_given(problem: Problem, model: AxisModel) -> float:
         else:
             level = level + effect.evaluate(x, w, still, still, row)
     power = ((force - np.sign(w) * np.maximum(level, 0.0)) * w).reshape(PLACES, -1).mean(axis=0)
+    power = power + power[::-1] if both else power
     return float(np.max(power) / (model.rated_force * np.max(np.abs(v))))

@@ -123,6 +123,8 @@ def test_energy_from_nowhere_is_refused() -> None:
     odd = AXIS.with_effect("viscous", {"b_extra": -4e-3})
     assert power_given(problem, odd) > 0.02
     assert any("energy" in r for r in judged(problem, AXIS, odd).refusals)
+    # what helps one way and hinders the other
+    assert power_given(problem, AXIS.with_effect("viscous_direction", {"b_dir": 5e-3})) <= 0.0
     # what depends on the place alone gives back what it takes
     unstable = AXIS.with_effect("spring", {"k": -0.1})
     assert power_given(problem, unstable) == pytest.approx(power_given(problem, AXIS))
