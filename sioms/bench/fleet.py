@@ -31,6 +31,8 @@ from sioms.client.zenoh_keys import config, endpoint
 
 from .figures import Bar, Report
 from .options import Options
+from .reach import fail
+from .watching import HISTORY
 from .workcells import axes, workcell
 
 CELLS = 8
@@ -122,6 +124,8 @@ def bench_fleet(options: Options, report: Report) -> None:
         _again(options, report, gateways[0])
         _strangers(options, report, gateways[0])
         _clocks(options, report, gateways[0])
+    with Daemon(workcell([axes("mod0", history=HISTORY, limits=False)])) as daemon:
+        fail(options, report, daemon, ZenohGateway)
 
 
 def _stops(options: Options, report: Report, fleet: Fleet, gateway: ZenohGateway) -> None:

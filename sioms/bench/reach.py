@@ -115,7 +115,7 @@ def bench_reach(options: Options, report: Report) -> None:
             _readings(options, report, far)
             _stops(options, report, far)
             _clocks(options, report, gateway)
-        _fail(options, report, daemon)
+        fail(options, report, daemon)
 
 
 def _requests(options: Options, report: Report, far: Workcell, near: Workcell) -> None:
@@ -196,20 +196,21 @@ def _clocks(options: Options, report: Report, gateway: Gateway) -> None:
     report.value("trials in which it did not hold the truth", wrong, bars=[Bar("value", 0)], notes=f"of {trials}")
 
 
-def _fail(options: Options, report: Report, daemon: Daemon) -> None:
+def fail(options: Options, report: Report, daemon: Daemon, kind: type[Gateway] = Gateway) -> None:
+    """Let each end of a link fail, and the link itself, while a remote client moves four axes."""
     bar = Bar("max", 1e3 * DEFAULT_LEASE_S + 20)
     for what in ("client killed", "client hung", "gateway killed", "gateway hung", "link cut", "link stalled"):
         samples = []
         trials = options.slow(3, 100)
         for trial in range(trials):
-            samples.append(_fail_once(what, daemon))
+            samples.append(_fail_once(what, daemon, kind))
             report.progress(f"reach: {what}, {trial} of {trials}")
         report.samples(f"{what} to its 4 axes halting", samples, "ms", bars=[bar], notes="none missed")
 
 
-def _fail_once(what: str, daemon: Daemon) -> int:
+def _fail_once(what: str, daemon: Daemon, kind: type[Gateway]) -> int:
     """Let something fail while a remote client moves axes; return how long they went on [ns]."""
-    with Gateway(daemon.socket) as gateway, Relay(gateway.port) as relay, daemon.cell() as cell:
+    with kind(daemon.socket) as gateway, Relay(gateway.port) as relay, daemon.cell() as cell:
         victim = subprocess.Popen(
             [sys.executable, "-P", "-c", _CRUISE, gateway.trusted(relay.port), str(SPEED)], stdout=subprocess.PIPE,
             stderr=subprocess.DEVNULL, preexec_fn=ends_with_us(),

@@ -22,6 +22,7 @@ from sioms.protocol.driver_verbs import (
     DriverVerb,
     ForkServerVerb,
     Held,
+    HeldSilent,
     Input,
     InUse,
     LinkChanged,
@@ -167,6 +168,7 @@ RECORDED: list[tuple[Message, str]] = [
     (Stopped("io0.bit3"), "931705a8696f302e62697433"),
     (LinkChanged(2, "unplugged"), "94180502a9756e706c7567676564"),
     (AlarmChanged(0, 1, -1, "fault", 2, "stalled"), "981a050001ffa56661756c7402a77374616c6c6564"),
+    (HeldSilent("mod0", "mute"), "941b05a46d6f6430a46d757465"),
     (LogLine("error", "no"), "941905a56572726f72a26e6f"),
     (
         Describe("mod0", "sim-axis", {"a": [1, True]}, "/etc"),
