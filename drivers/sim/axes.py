@@ -33,7 +33,7 @@ import time
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 import msgspec
 import numpy as np
@@ -160,6 +160,9 @@ class SimAxes(TickDriver):
         inputs = tuple(dict.fromkeys(axis.load_node for axis in axes if axis.load_node))
         return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
+    make_up_ns: ClassVar[int] = 5_000_000
+    """How long a tick may make up for turns [ns]: a machine that is too slow for them shows its axes in slow motion."""
+
     def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
         axes, plant, *port = self.describe(name, settings).blocks
@@ -214,7 +217,8 @@ class SimAxes(TickDriver):
         """Let the world go on under the last command up to now, measure, and command anew.
 
         The controller of a device does not miss its turns because this machine was busy: after a late tick they are
-        made up for, a few at once, and shown each at its own time. Later than ``late_max_s`` the bank stops all motion.
+        made up for, a few at once, and shown each at its own time; what that cannot be done for soon is left to the
+        next tick, so that others are served meanwhile. Later than ``late_max_s`` the bank stops all motion.
         """
         if self._found:
             found, self._found = self._found, 0
@@ -226,14 +230,26 @@ class SimAxes(TickDriver):
             self._last_ns += max(0, (now_ns - self._last_ns) // self._tick_ns - 1) * self._tick_ns
             self._is_still = False
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
-        if now_ns - self._last_ns <= self._late_ns:
-            while behind > self._stride:
-                at_ns = self._last_ns + self._stride * self._tick_ns
-                self._turn(at_ns, self._stride)
-                for block in self.blocks:  # what looks at these axes sees them go there
-                    self.kit.publish(block, at_ns)
-                behind -= self._stride
-        self._turn(now_ns, behind)
+        if now_ns - self._last_ns <= self._late_ns and behind > self._stride:
+            behind = self._make_up(behind)
+        late = behind > self._stride and now_ns - self._last_ns <= self._late_ns
+        if not late:
+            self._turn(now_ns, behind)
+        for block in self.blocks:
+            block.stamp_ns = self._last_ns if late else 0
+
+    def _make_up(self, behind: int) -> int:
+        """Make up for turns, for as long as that may take, and show them; return how many are left."""
+        until_ns = time.monotonic_ns() + self.make_up_ns
+        while behind > self._stride:
+            at_ns = self._last_ns + self._stride * self._tick_ns
+            self._turn(at_ns, self._stride)
+            behind -= self._stride
+            if time.monotonic_ns() >= until_ns:
+                break  # this one is shown as that of the tick
+            for block in self.blocks:  # what looks at these axes sees them go there
+                self.kit.publish(block, at_ns)
+        return behind
 
     def open(self) -> None:
         """Wait for the loads."""

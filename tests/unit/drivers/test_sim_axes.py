@@ -147,6 +147,8 @@ def test_late_ticks_cost_the_world_no_time(bench):
 
 def test_the_world_is_the_same_whether_it_goes_on_before_the_tick_or_in_the_slack_after_the_last(bench):
     mods = [bench.make(SimAxes, name, {"axis": [SERVO, STEPPER]}) for name in ("mod0", "mod1")]
+    for mod in mods:
+        mod.make_up_ns = 10**12
     told = [[], []]
     for at in (1, 2, 3, 4, 7, 8, 9, 300, 301, 302):  # some ticks late; the second device is given its slack
         bench.clock_ns = 1_000_000_000 + at * 1_000_000
@@ -290,6 +292,7 @@ def test_a_starved_machine_moves_as_a_free_one(bench, bandwidth_hz):
 def test_a_late_tick_shows_every_turn_that_it_makes_up_for(bench):
     """Another device's beam sees an axis that came and went meanwhile."""
     mod = bench.make(SimAxes, "mod0", {"axis": [SERVO]})
+    mod.make_up_ns = 10**12
     box = {"bit": 0, "boxes": [{"mod0.plant.x_position": [0.0045, 0.2]}]}
     io = bench.make(SimIo, "io0", {"inputs": 1, "beam": [box]})
     bench.run(0.01)
@@ -308,6 +311,7 @@ def test_a_late_tick_shows_every_turn_that_it_makes_up_for(bench):
 @pytest.mark.parametrize("verb", ["stop", "emergency_stop", "replace"])
 def test_no_verb_has_set_points_run_ahead_of_a_late_world(bench, verb):
     mod = bench.make(SimAxes, "mod0", {"axis": [SERVO | {"following_error_max": 0.05}], "late_max_s": 0.1})
+    mod.make_up_ns = 10**12
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.VELOCITY, velocity=0.5)
     bench.run(0.3)
@@ -323,3 +327,25 @@ def test_no_verb_has_set_points_run_ahead_of_a_late_world(bench, verb):
     steps = np.diff([fields["commanded_position"] for _, fields in turns]) / np.diff([stamp for stamp, _ in turns])
     assert max(abs(steps)) < 0.51e-9, "no further than a turn goes at 0.5 m/s"
     assert not status(mod) & AxisStatus.FAULT
+
+
+def test_a_machine_that_is_too_slow_shows_its_axes_in_slow_motion_and_ends_each_tick(bench):
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO], "late_max_s": 30.0})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.VELOCITY, velocity=0.1)
+    bench.run(0.2)
+    mod.make_up_ns = 0  # one turn a tick
+    began_ns, began = bench.clock_ns, float(mod.bank.rows["commanded_position"][0])
+    bench.clock_ns += 200_000_000
+    for tick in range(20):
+        bench.clock_ns += 1_000_000
+        mod.tick(bench.clock_ns)
+        world_ns = mod.blocks[0].stamp_ns
+        assert world_ns == mod.blocks[1].stamp_ns == began_ns + (tick + 1) * mod._stride * 1_000_000
+        went = float(mod.bank.rows["commanded_position"][0]) - began
+        assert went == pytest.approx(0.1 * (world_ns - began_ns) * 1e-9, rel=1e-6)
+    mod.make_up_ns = 10**12
+    bench.run(0.001)
+    assert mod.blocks[0].stamp_ns == 0, "of the tick again"
+    went = float(mod.bank.rows["commanded_position"][0]) - began
+    assert went == pytest.approx(0.1 * (bench.clock_ns - began_ns) * 1e-9, rel=1e-6)
