@@ -19,7 +19,8 @@ START_NS = 5_000_000_000
 
 def info(name: str, node_class: NodeClass, units: list[str], names: str = "abcdefgh") -> NodeInfo:
     """Return what a node is."""
-    channels = [ChannelInfo(names[i], unit).pack() for i, unit in enumerate(units)]
+    width = 8 if node_class is NodeClass.BINARY else 0
+    channels = [ChannelInfo(names[i], unit, width=width).pack() for i, unit in enumerate(units)]
     return NodeInfo([name, int(node_class), False, channels, -1, 1000.0, 16, "dev", "sim-axes", 2])
 
 

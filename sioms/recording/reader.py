@@ -343,12 +343,17 @@ class Recording:
 
     # --- what is asked for -----------------------------------------------------------------------
 
+    @property
+    def events_channel(self) -> int:
+        """The channel of what happened; -1: there is none."""
+        if self._events < 0:
+            list(self.pieces(()))  # it may stand later in the file
+        return self._events
+
     def events(self) -> list[Event]:
         """Return what happened, in the order of stamps."""
-        if self._events < 0:
-            list(self.pieces(()))  # its channel may stand later in the file
         found = []
-        for piece in self.pieces([self._events]):
+        for piece in self.pieces([self.events_channel]):
             for when, data in piece.messages(self._events):
                 try:
                     event = Event.of(data)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +14,9 @@ from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.records import READ
 
-from .reader import Recording
+from .messages import Event
+from .reader import Recording, Table
 
-FORMATS = (".csv", ".npz", ".parquet")
 _TITLES = {"commanded_position": "command", "data": ""}
 """Columns whose titles are others than their names: those of ``devin --record``."""
 
@@ -41,8 +43,11 @@ def columns_of(
         columns: of its class; None: all.
         start_ns, end_ns: from when until when [ns, CLOCK_MONOTONIC].
     """
-    info = recording.node(node).info
-    table = recording.table(node, columns, start_ns, end_ns)
+    return of_table(recording.node(node).info, recording.table(node, columns, start_ns, end_ns))
+
+
+def of_table(info: NodeInfo, table: Table) -> dict[str, NDArray[Any]]:
+    """Return readings by heads; see ``columns_of``."""
     found: dict[str, NDArray[Any]] = {"time [s]": table.stamps_ns / 1e9, "number": table.numbers}
     for channel in range(len(info.channels)):
         for column, values in table.values.items():
@@ -50,29 +55,17 @@ def columns_of(
     return found
 
 
-def export(columns: dict[str, NDArray[Any]], path: Path) -> None:
-    """Write a table: CSV, NPZ or Parquet, by the ending of the name.
-
-    Raises:
-        OSError: it cannot be written, or EINVAL, an ending that is none of these.
-        ModuleNotFoundError: pyarrow is not installed, for Parquet.
-    """
-    match path.suffix:
-        case ".csv":
-            with open(path, "w", encoding="utf-8") as file:
-                file.write(",".join(columns) + "\n")
-                rows = zip(*[values.tolist() for values in columns.values()], strict=True)
-                for row in rows:
-                    file.write(f"{row[0]:.9f}," + ",".join([repr(value) for value in row[1:]]) + "\n")
-        case ".npz":
-            np.savez_compressed(path, **columns)  # type: ignore[arg-type]
-        case ".parquet":
-            import pyarrow
-            from pyarrow import parquet
-
-            parquet.write_table(pyarrow.table(columns), path)
-        case _:
-            raise OSError(22, f"export to {path}: want a name that ends in {', '.join(FORMATS)}")
+def of_events(events: Sequence[Event]) -> dict[str, NDArray[Any]]:
+    """Return what happened as a table: data as JSON, messages as they came in hexadecimal."""
+    words = ("source", "kind", "node", "who", "error", "text")
+    columns: dict[str, list[Any]] = {
+        "time [s]": [event.stamp_ns / 1e9 for event in events],
+        **{word: [getattr(event, word) for event in events] for word in words},
+        "data": [json.dumps(event.data, default=str) if event.data else "" for event in events],
+        "raw": [event.raw.hex() for event in events],
+    }  # fmt: skip
+    kinds = {"time [s]": np.float64, "error": np.int64}
+    return {name: np.array(values, kinds.get(name, np.str_)) for name, values in columns.items()}
 
 
 def main_column(info: NodeInfo) -> str:

@@ -10,12 +10,15 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from sioms.documents import json_text
+from sioms.recording.export import FORMATS, export
 from sioms.recording.messages import Event
 from sioms.recording.reader import Recording
 from sioms.recording.rewrite import rewrite
 from sioms.recording.story import happened, sentence, utc
-from sioms.recording.tables import FORMATS, columns_of, export, head_of, main_column
+from sioms.recording.tables import head_of, main_column, of_events, of_table
 
 
 def add_parser(subparsers: Any) -> None:
@@ -32,9 +35,10 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument("-c", "--column", default="", help="e.g. velocity (default: position of axes, data of others)")
     one.add_argument("-o", "--output", metavar="PICTURE", required=True, help="PNG, SVG or PDF to write")
     _add_span(one)
-    one = actions.add_parser("export", help="write a node as a table")
+    one = actions.add_parser("export", help="write a node, or what happened, as a table")
     one.add_argument("file", metavar="FILE")
-    one.add_argument("node", metavar="NODE")
+    one.add_argument("node", metavar="NODE", nargs="?", help="node (default: the only one that is recorded)")
+    one.add_argument("-e", "--events", action="store_true", help="write what happened instead of a node")
     one.add_argument("-o", "--output", metavar="TABLE", required=True, help=f"file that ends in {', '.join(FORMATS)}")
     one.add_argument("-c", "--column", action="append", help="e.g. position; several by several -c (default: all)")
     _add_span(one)
@@ -64,10 +68,7 @@ def run(args: argparse.Namespace) -> int:
             lost = _plot(args)
         case "export":
             with Recording(args.file) as recording:
-                start, end = _span(recording, args)
-                offset = recording.offset_ns
-                table = columns_of(recording, args.node, args.column, start - offset, end - offset)
-                export(table, _fresh(args.output))
+                _export(recording, args)
                 lost = recording.damage
         case "cut":
             with Recording(args.file) as recording:
@@ -80,6 +81,25 @@ def run(args: argparse.Namespace) -> int:
     for text in lost:
         print(f"sioms log: {text}", file=sys.stderr)
     return 1 if lost else 0
+
+
+def _export(recording: Recording, args: argparse.Namespace) -> None:
+    path, offset_ns = _fresh(args.output), recording.offset_ns
+    if path.suffix not in FORMATS:
+        raise OSError(errno.EINVAL, f"export to {path}: want a name that ends in {', '.join(FORMATS)}")
+    start_ns, end_ns = (each - offset_ns for each in _span(recording, args))
+    if args.events:
+        events = [event for event in recording.events() if start_ns <= event.stamp_ns < end_ns]
+        stamps = np.array([event.stamp_ns for event in events], np.int64)
+        export(of_events(events), path, stamps + offset_ns, recording.about)
+        return
+    name = args.node or (next(iter(recording.nodes)) if len(recording.nodes) == 1 else "")
+    if not name:
+        nodes = ", ".join(recording.nodes) or "none"
+        raise OSError(errno.EINVAL, f"export {recording.path}: name one of its nodes, or --events; there are: {nodes}")
+    info, table = recording.node(name).info, recording.table(name, args.column, start_ns, end_ns)
+    about = recording.about | {"node": name, "device": info.device, "class": info.node_class.name.lower()}
+    export(of_table(info, table), path, table.stamps_ns + offset_ns, about)
 
 
 def _fresh(path: str) -> Path:

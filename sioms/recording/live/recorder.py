@@ -101,7 +101,18 @@ class Recorder:
     # --- what is read ----------------------------------------------------------------------------
 
     def _attach(self, cell: Workcell) -> None:
-        """Open what is there and not open yet."""
+        """Open what is there and not open yet, journals first: a replay begins with the first node."""
+        try:
+            for device in ["", *[each["name"] for each in cell.status()["devices"]]] if self._may_hear else []:
+                if device not in self._journals:
+                    fds = cell.journal(device)
+                    self._journals[device] = JournalTap(*fds, device or "daemon", from_start=self._past)
+        except OSError as error:
+            if error.errno not in (errno.EPERM, errno.EROFS):
+                raise
+            self._may_hear = False
+            self._tell("lost", text=f"commands, stops and faults are not recorded: {error.strerror}")
+            self._log(f"only readings are recorded: {error.strerror}")
         entries = cell.nodes()
         alike = {(e.name, e.device, e.node_class, e.channels) for e in entries}
         for entry in entries:
@@ -121,17 +132,6 @@ class Recorder:
                     self._tell("opened again", name, text="its driver process is another one")
             except OSError as error:
                 self._log(f"{name}: {error.strerror}")
-        try:
-            for device in ["", *[each["name"] for each in cell.status()["devices"]]] if self._may_hear else []:
-                if device not in self._journals:
-                    fds = cell.journal(device)
-                    self._journals[device] = JournalTap(*fds, device or "daemon", from_start=self._past)
-        except OSError as error:
-            if error.errno not in (errno.EPERM, errno.EROFS):
-                raise
-            self._may_hear = False
-            self._tell("lost", text=f"commands, stops and faults are not recorded: {error.strerror}")
-            self._log(f"only readings are recorded: {error.strerror}")
         self._poll = poll()
         self._poll.register(cell.fileno(), POLLIN)
 

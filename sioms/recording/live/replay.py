@@ -14,13 +14,18 @@ import select
 import socket
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 from sioms.protocol import verbs
 from sioms.protocol.flags import PROTOCOL_VERSION, READONLY, Access, NodeClass, PageState, Right
+from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, refusal, reply
 from sioms.protocol.page import PageWriter, page_size
+from sioms.recording import mcap
+from sioms.recording.messages import Event
+from sioms.recording.notes import noted
 from sioms.recording.reader import NodeRecord, Recording
 
 SLOTS = 8192
@@ -59,6 +64,19 @@ class Served:
                     continue  # full, or its reader has gone
 
 
+class Journal:
+    """A journal that is served.
+
+    Attributes:
+        fd: of its memory; writer: notes in it.
+    """
+
+    def __init__(self) -> None:
+        self.fd = os.memfd_create("sioms:replay:journal", os.MFD_CLOEXEC)
+        os.ftruncate(self.fd, HEADER + JOURNAL_SIZE)
+        self.writer = JournalWriter(memoryview(mmap.mmap(self.fd, HEADER + JOURNAL_SIZE)))
+
+
 @dataclass(slots=True, eq=False)
 class Peer:
     """A connection: a session, or the handle of a node."""
@@ -95,6 +113,10 @@ class Replay:
         self._epoll.register(self._listener.fileno(), select.EPOLLIN)
         self._peers: dict[int, Peer] = {}
         self._nodes = {name: self._serve_node(record) for name, record in recording.nodes.items()}
+        self._journals: dict[str, Journal] = {"daemon": Journal()}
+        for record in recording.nodes.values():
+            self._serve_journal(record.info.device)
+        self._leash = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         self._numbers = 0
         self.opened = False
         self.published = 0
@@ -112,13 +134,20 @@ class Replay:
         fcntl.fcntl(fd, fcntl.F_ADD_SEALS, _SEALS)
         return Served(record, page, fd)
 
+    def _serve_journal(self, source: str) -> Journal:
+        return self._journals.setdefault(source, Journal())
+
     # --- time ------------------------------------------------------------------------------------
 
-    def _snapshots(self) -> Iterator[tuple[int, Served, Any]]:
-        """Yield the snapshots of all nodes in the order of their times, within each piece of the file."""
+    def _all(self) -> Iterator[tuple[int, Served | None, Any]]:
+        """Yield snapshots with their nodes, and events, in the order of their times, within each piece of the file."""
         by_channel = {served.record.channel: served for served in self._nodes.values()}
-        for piece in self._recording.pieces(by_channel):
-            batch = []
+        events = self._recording.events_channel
+        for piece in self._recording.pieces([*by_channel, events]):
+            batch: list[tuple[int, Served | None, Any]] = []
+            for stamp_ns, data in piece.messages(events):
+                with suppress(mcap.Damaged):  # the reader of events tells of it
+                    batch.append((stamp_ns, None, Event.of(data)))
             for channel, served in by_channel.items():
                 when, rows = piece.rows(channel, 4 + served.record.size)
                 if len(rows):
@@ -134,23 +163,23 @@ class Replay:
             until: whether it shall end before its end.
             wait: do not begin before a node is opened.
         """
-        first: dict[int, Any] = {}
-        queue = self._snapshots()
         begin_ns = zero_ns = 0
-        for stamp_ns, served, row in queue:
-            if id(served) not in first:  # who opens it before the beginning reads what it begins with
-                first[id(served)] = row
+        before: list[tuple[int, Event]] = []
+        for stamp_ns, served, row in self._all():
             if not begin_ns:
-                zero_ns = stamp_ns
-                now_ns = time.monotonic_ns()
-                served.publish(row, now_ns)
-                self.published += 1
+                zero_ns = zero_ns or stamp_ns
+                if served is None:
+                    before.append((stamp_ns, row))
+                    continue
+                self._tell(served, row, time.monotonic_ns())
                 for each in self._nodes.values():
                     each.page.set_state(PageState.GOOD)
                 while wait and not self.opened and not until():
                     self._alive()
                     self.look(0.1)
                 begin_ns = time.monotonic_ns()
+                for at_ns, event in before:
+                    self._tell(None, event, begin_ns + int((at_ns - zero_ns) / self._rate))
                 continue
             due_ns = begin_ns + int((stamp_ns - zero_ns) / self._rate)
             while (left_ns := due_ns - time.monotonic_ns()) > 0 and not until():
@@ -158,10 +187,18 @@ class Replay:
                 self.look(min(left_ns / 1e9, 0.1))
             if until():
                 return
-            served.publish(row, due_ns)
-            self.published += 1
+            self._tell(served, row, due_ns)
             if self.published % 64 == 0:
                 self.look(0.0)
+
+    def _tell(self, served: Served | None, row: Any, due_ns: int) -> None:
+        """Publish a snapshot, or note an event."""
+        self.published += served is not None
+        if served is not None:
+            served.publish(row, due_ns)
+        elif (note := noted(row)) is not None:
+            source = "daemon" if row.source == "recorder" else row.source
+            self._serve_journal(source).writer.note(note[0], due_ns, *note[1])
 
     def _alive(self) -> None:
         for served in self._nodes.values():
@@ -173,6 +210,8 @@ class Replay:
             served.page.set_state(PageState.CLOSED, "the recording has ended")
         for peer in list(self._peers.values()):
             self._drop(peer)
+        for fd in (*self._leash, *(journal.fd for journal in self._journals.values())):
+            os.close(fd)
         self._listener.close()
         os.unlink(self.path)
 
@@ -222,18 +261,20 @@ class Replay:
             case verbs.Hello():
                 value = [PROTOCOL_VERSION, self._recording.about.get("workcell", ""), int(Right.READ)]
             case verbs.List():
-                value = [
-                    [s.record.info.name, int(s.record.info.node_class), len(s.record.info.channels), True,
-                     s.record.info.device, "up", "", s.record.bit] for s in self._nodes.values()
-                ]  # fmt: skip
+                value = [line for served in self._nodes.values() for line in self._lines(served)]
             case verbs.Info(node):
                 served, channels = self._find(node)
                 if served is None:
                     peer.sock.send(self._unknown(number, node))
                     return
-                value = _packed(served.record, node, channels)
+                value = _packed(served.record, node, channels, self._bit(served, node))
             case verbs.Status():
                 value = self._status()
+            case verbs.Alarms():
+                value = []  # their lines of the log are replayed; what is in force now nobody knows
+            case verbs.Journal(device):
+                self._journal(peer, number, device)
+                return
             case verbs.Open():
                 self._open(peer, number, message)
                 return
@@ -247,16 +288,50 @@ class Replay:
                 return
         peer.sock.send(reply(number, value))
 
+    def _lines(self, served: Served) -> Iterator[list[Any]]:
+        """Yield the lines of a node and its parts in the list of nodes."""
+        info, bit = served.record.info, served.record.bit
+        yield [info.name, int(info.node_class), len(info.channels), True, info.device, "up", "", bit]
+        is_port = info.node_class is NodeClass.BINARY
+        count = info.channels[0].width if is_port and len(info.channels) == 1 and bit < 0 else 0
+        parts = [(f"bit{number}", number) for number in range(count)]
+        if not is_port and len(info.channels) > 1:
+            parts = [(channel.name, -1) for channel in info.channels]
+        for part, number in parts:
+            if (name := f"{info.name}.{part}") not in self._nodes:
+                yield [name, int(info.node_class), 1, True, info.device, "up", "", number]
+
+    def _bit(self, served: Served, name: str) -> int:
+        """Return which bit of a port a node by this name is, -1 for none."""
+        name = name.removesuffix(READONLY)
+        if name == served.record.info.name:
+            return served.record.bit
+        part = name.rpartition(".")[2]
+        return int(part[3:]) if served.record.info.node_class is NodeClass.BINARY else -1
+
+    def _journal(self, peer: Peer, number: int, device: str) -> None:
+        """Serve a journal: what happened, as far as it is recorded, is noted there again."""
+        journal = self._journals.get(device or "daemon")
+        if journal is None:
+            text = f"open the journal of {device}: nothing of it is recorded; there are: {', '.join(self._journals)}"
+            peer.sock.send(refusal(number, errno.ENOENT, text))
+            return
+        fd = os.open(f"/proc/self/fd/{journal.fd}", os.O_RDONLY | os.O_CLOEXEC)
+        try:
+            socket.send_fds(peer.sock, [reply(number, 1)], [fd, self._leash[0]])
+        finally:
+            os.close(fd)
+
     def _find(self, name: str) -> tuple[Served | None, list[int]]:
         """Return a node by its name, that of its companion, or that of one of its channels, and which these are."""
         name = name.removesuffix(READONLY)
         if served := self._nodes.get(name):
             return served, list(range(len(served.record.info.channels)))
         parent, _, channel = name.rpartition(".")
-        if (served := self._nodes.get(parent)) and served.record.info.node_class is not NodeClass.BINARY:
-            names = [each.name for each in served.record.info.channels]
-            if channel in names:
-                return served, [names.index(channel)]
+        served = self._nodes.get(parent)
+        if served is not None and name in [line[0] for line in self._lines(served)]:
+            is_bit = served.record.info.node_class is NodeClass.BINARY
+            return served, [0 if is_bit else [each.name for each in served.record.info.channels].index(channel)]
         return None, []
 
     def _unknown(self, number: int, name: str) -> bytes:
@@ -279,7 +354,8 @@ class Replay:
         handle = Peer(ours, self._handle, verbs.ON_HANDLE, served, wake)
         self._add(handle)
         peer.handles[self._numbers] = handle
-        value = [self._numbers, _packed(served.record, name, channels), channels, served.record.bit, [os.getpid()] * 2]
+        bit = self._bit(served, name)
+        value = [self._numbers, _packed(served.record, name, channels, bit), channels, bit, [os.getpid()] * 2]
         with theirs:
             socket.send_fds(peer.sock, [reply(number, value)], [served.fd, readable, theirs.fileno()])
         os.close(readable)
@@ -319,10 +395,10 @@ def _refused(what: str) -> str:
     return f"{what}: this is a recording that is replayed; it can only be read"
 
 
-def _packed(record: NodeRecord, name: str, channels: list[int]) -> list[Any]:
+def _packed(record: NodeRecord, name: str, channels: list[int], bit: int) -> list[Any]:
     info = record.info
     chosen = [info.channels[channel].pack() for channel in channels]
     return [
-        name, int(info.node_class), True, chosen, record.bit, info.tick_hz, info.buffer_capacity, info.device,
+        name, int(info.node_class), True, chosen, bit, info.tick_hz, info.buffer_capacity, info.device,
         info.driver, PROTOCOL_VERSION,
     ]  # fmt: skip

@@ -11,13 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.client.workcell import Workcell
-from sioms.protocol import verbs
-from sioms.protocol.flags import PageState, Request
-from sioms.protocol.journal import Event as Noted
-from sioms.protocol.journal import JournalReader, Note
-from sioms.protocol.messages import MalformedMessage
+from sioms.protocol.flags import PageState
+from sioms.protocol.journal import JournalReader
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.recording.messages import Event
+from sioms.recording.notes import told
 
 
 class PageTap:
@@ -181,49 +179,3 @@ class JournalTap:
         os.close(self._leash)
         self._reader.release()
         self._map.close()
-
-
-def told(source: str, noted: Noted) -> Event:
-    """Return an event of a journal as it is recorded."""
-    try:
-        kind, values = Note(noted.kind), noted.values()
-        fields, word = _FIELDS[kind](*values), str(kind.name).lower()
-    except (ValueError, TypeError, MalformedMessage) as error:
-        return Event(noted.stamp_ns, noted.number, source, f"unknown {noted.kind}", text=str(error), raw=noted.payload)
-    return Event(noted.stamp_ns, noted.number, source, word, **fields)
-
-
-def _command(node: str, who: str, packet: bytes, errno: int, why: str) -> dict[str, Any]:
-    data: dict[str, Any] = {}
-    try:
-        number, message = verbs.take(packet, verbs.ON_HANDLE)
-        data = {"verb": type(message).__name__, "number": number}
-        for name, value in zip(message.fields, message, strict=True):
-            data[name] = len(value) if isinstance(value, bytes) else value
-        if isinstance(message, verbs.Ioctl):
-            data["request"] = Request(message.request).name
-    except (MalformedMessage, ValueError):
-        pass
-    return {"node": node, "who": who, "error": errno, "text": why, "data": data, "raw": packet}
-
-
-_FIELDS: dict[int, Any] = {
-    Note.COMMAND: _command,
-    Note.REFUSAL: lambda node, who, number, errno, why: {
-        "node": node, "who": who, "error": errno, "text": why, "data": {"number": number},
-    },
-    Note.STOP: lambda how, why, parts: {"text": why, "data": {"stop": how, "parts": parts}},
-    Note.FAULT: lambda names, why: {"text": why, "data": {"channels": names}},
-    Note.LINK: lambda state, why: {"text": why, "data": {"state": state}},
-    Note.RESET: lambda block, channels: {"data": {"block": block, "channels": channels}},
-    Note.LOG: lambda level, event, values: {
-        "text": event, "who": str(values.get("peer") or values.get("by") or ""), "node": str(values.get("node") or ""),
-        "data": {"level": level, **values},
-    },
-    Note.REQUEST: lambda who, verb, arguments, errno, why: {
-        "who": who, "error": errno, "text": why, "data": {"verb": verb, "arguments": arguments},
-        "node": str(arguments[0]) if verb in ("Open", "EmergencyStop", "Reset") else "",
-    },
-    Note.MARKER: lambda device, number: {"data": {"device": device, "marker": number}},
-    Note.CLOSED: lambda node, who: {"node": node, "who": who},
-}  # fmt: skip

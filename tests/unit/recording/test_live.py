@@ -15,7 +15,9 @@ from sioms.protocol.journal import HEADER, JournalReader, JournalWriter, Note
 from sioms.protocol.page import PageReader, PageWriter, page_size
 from sioms.protocol.verbs import Ioctl
 from sioms.recording.live.files import LiveFile
-from sioms.recording.live.taps import PageTap, told
+from sioms.recording.live.taps import PageTap
+from sioms.recording.messages import Event
+from sioms.recording.notes import noted, told
 from sioms.recording.reader import Recording
 
 
@@ -49,6 +51,27 @@ def test_commands_tell_who_gave_them_and_why_they_were_refused() -> None:
     assert command.data is not None and command.data["request"] == "STOP"
     assert (stop.kind, stop.text, stop.stamp_ns) == ("stop", "emergency stop by eva", 6)
     assert unknown.kind == "unknown 99"
+
+
+def test_an_event_becomes_the_note_that_it_was() -> None:
+    memory = bytearray(HEADER + 8192)
+    writer, reader = JournalWriter(memoryview(memory)), JournalReader(memory)
+    packet = Ioctl(int(Request.STOP), None, 0.0).packed(3)
+    notes: list[tuple[int, list[Any]]] = [
+        (Note.COMMAND, ["mod0", "eva", packet, errno.EPERM, "no right"]), (Note.REFUSAL, ["mod0", "eva", 7, 5, "lost"]),
+        (Note.STOP, ["EMERGENCY", "smoke", [["axes", [0, 1], -1]]]), (Note.FAULT, [["xaxis"], "following error"]),
+        (Note.LINK, ["LINK_LOST", "silent"]), (Note.RESET, ["axes", [0]]), (Note.MARKER, ["mod0", 5]),
+        (Note.LOG, ["info", "device up", {"device": "mod0", "pid": "7"}]), (Note.CLOSED, ["mod0", "eva"]),
+        (Note.REQUEST, ["eva", "Open", ["mod0", 3, 0.0, 0.0], 0, ""]),
+    ]  # fmt: skip
+    assert {kind for kind, _ in notes} == set(Note)
+    for kind, values in notes:
+        writer.note(kind, 5, *values)
+    assert [noted(told("mod0", event)) for event in reader.read()] == notes
+    assert noted(Event(5, 0, "mod0", "unknown 99")) is None and noted(Event(5, 0, "mod0", "stop")) is None
+    assert noted(Event(5, 0, "recorder", "lost", text="3 snapshots")) == (
+        Note.LOG, ["info", "recorder: lost", {"text": "3 snapshots", "node": ""}]
+    )  # fmt: skip
 
 
 def test_a_full_disk_leaves_whole_records(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
