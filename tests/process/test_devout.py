@@ -7,6 +7,7 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import pytest
 from daemon_rig import Daemon, axes, daemons, wait_for
@@ -126,6 +127,11 @@ def test_a_devout_that_is_stopped_halts_its_axes(
     assert process.wait(10) == 1
     assert process.stderr is not None
     assert b"its client was stopped, as by Ctrl-Z" in process.stderr.read()
+
+
+def test_a_frozen_devout_is_borne_no_longer_than_the_documents_say() -> None:
+    page = (Path(__file__).parents[2] / "docs/pipe-tools.md").read_text()
+    assert f"suspended (Ctrl-Z), frozen or swapped out for {FROZEN_S:g} s" in page.replace("\n", " ").replace("  ", " ")
 
 
 def test_a_devout_that_lives_keeps_all_its_axes(

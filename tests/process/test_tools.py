@@ -344,9 +344,13 @@ def monitor(daemon: Daemon) -> Iterator[MonitorTerminal]:
         os.close(one.terminal)
 
 
-def test_monitor_in_a_terminal_stops_and_resets_by_key(monitor: MonitorTerminal, cell: sioms.Workcell) -> None:
+def test_monitor_in_a_terminal_stops_and_resets_by_key(
+    monitor: MonitorTerminal, cell: sioms.Workcell, daemon: Daemon
+) -> None:
     monitor.shows(b"mod0")
     monitor.shows(b"taxis")
+    with daemon.frozen(daemon.device("mod0")["pid"]):  # what cannot be read any more is told as old, never as live
+        monitor.shows(b"LAST SEEN")
     monitor.press(b" ")
     wait_for(lambda: cell.status()["stopped_ns"], "the stop")
     monitor.shows(b"EMERGENCY STOP for")
