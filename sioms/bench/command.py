@@ -39,6 +39,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     ),
     "tactile": ("tactile", "shape from strain: time of a frame, errors against theory, convergence"),
     "attack": ("attack", "floods by one user beside victims of another"),
+    "hand": ("hand", "the hand's acceptance in a simulated plane: kinematics, rolls, regrasps, force, friction cone"),
     "deaths": (
         "killing",
         "processes killed and stopped at random points, alone and together: --trials N kills",

@@ -27,8 +27,8 @@ class Gains:
         spring_rate: K_d [1/s].
         spring: K_s [N/m].
         damper: K_v [m/(s N)]; `damper_limit` tells where the loop becomes unstable.
-        filter_s: time constant of the force's low-pass [s]; 0 for none. Without one the link rings on the rubber at
-            400 Hz long before the quasi-static limit.
+        filter_s: time constant of the low-pass of the force and of what is wanted of it [s]; 0 for none. Without one
+            the link rings on the rubber at 400 Hz long before the quasi-static limit.
         opening_max: largest |d'| [m/s].
         contact_n: force from which on there is contact [N], >= 0.
         link_m: in contact the links alone squeeze: d' turns them instead of moving the carriages, so that a finger does
@@ -39,7 +39,7 @@ class Gains:
     spring_rate: float = 5.0
     spring: float = 100.0
     damper: float = 0.4
-    filter_s: float = 0.02
+    filter_s: float = 0.05
     opening_max: float = 0.1
     contact_n: float = 0.02
     link_m: float = 0.0
@@ -65,6 +65,8 @@ class Controller:
     def __init__(self, gains: Gains) -> None:
         self.gains = gains
         self.felt = 0.0
+        self._wanted: float | None = None  # after the filter
+        self._share, self._squeezes = 1.0, False
 
     def rates(
         self, goal: Sequence[float], along: Sequence[float], now: Sequence[float], wanted: float, force: float,
@@ -104,8 +106,11 @@ class Controller:
     def feel(self, force: float, sample_s: float) -> bool:
         """Take a sample of the force [N]; return whether there is contact."""
         gains = self.gains
-        share = 1.0 if gains.filter_s == 0.0 else -math.expm1(-sample_s / gains.filter_s)
-        self.felt += share * (force - self.felt)
+        self._share = 1.0 if gains.filter_s == 0.0 else -math.expm1(-sample_s / gains.filter_s)
+        self.felt += self._share * (force - self.felt)
+        if not self._squeezes:
+            self._wanted = None
+        self._squeezes = False
         return force > gains.contact_n or self.felt > gains.contact_n
 
     def squeeze(
@@ -116,8 +121,14 @@ class Controller:
         return self.opening(goal, along, now, wanted, touches), touches
 
     def opening(self, goal: float, along: float, now: float, wanted: float, touches: bool) -> float:
-        """Return the rate of d [m/s] for the force that was felt last."""
-        gains, error = self.gains, wanted - self.felt
+        """Return the rate of d [m/s] for the force that was felt last.
+
+        What is wanted is filtered as the force is, so that a step of it does not strike the link; not over a sample in
+        which nothing was asked for.
+        """
+        gains, aim = self.gains, self._wanted
+        aim = wanted if aim is None else aim + self._share * (wanted - aim)
+        self._wanted, self._squeezes, error = aim, True, aim - self.felt
         spring = along + gains.spring_rate * (goal - now - error / gains.spring)
         opening = -gains.damper * error if touches else spring
         return min(max(opening, -gains.opening_max), gains.opening_max)

@@ -112,6 +112,21 @@ def disk_time(eta: float, radius_m: float, speed: float, finger_m: float = FINGE
     return abs(eta) * (finger_m + radius_m) / (finger_m * speed)
 
 
+def rectangle_time(tilt: float, width_m: float, speed: float, finger_m: float = FINGER_M) -> float:
+    """Return how long [s] the law takes to bring a rectangle's tilt [rad] to 0 at |phi'| = speed [rad/s].
+
+    The integral of 1/`rectangle_spin` over the tilt.
+
+    Args:
+        tilt: direction of the side's normal less psi [rad].
+        width_m: between the two sides.
+        speed: [rad/s].
+        finger_m: rb.
+    """
+    lean = abs(tilt)
+    return ((width_m + 2.0 * finger_m) * math.tan(lean) - 2.0 * finger_m * lean) / (2.0 * finger_m * speed)
+
+
 def rectangle_spin(tilt: float, width_m: float, rate: float, finger_m: float = FINGER_M) -> float:
     """Return the spin [rad/s] of a rectangle under the rotation phi1' = phi2' = rate.
 

@@ -78,3 +78,14 @@ def test_no_rate_comes_out_of_what_is_not_known(bad: float) -> None:
     with pytest.raises(ValueError, match="want finite numbers"):
         law.rates(REST, [0.0] * 6, (*REST[:3], bad, *REST[4:]), 0.5, 0.1, 2.5e-3)
     assert law.felt == 0.0
+
+
+def test_what_was_wanted_before_a_pause_is_forgotten() -> None:
+    law = Controller(Gains(filter_s=0.05, opening_max=10.0))
+    for _ in range(100):
+        law.rates(REST, [0.0] * 6, REST, 1.0, 1.0, 2.5e-3)
+    law.feel(1.0, 2.5e-3)
+    law.feel(1.0, 2.5e-3)  # a sample in which nothing is asked for
+    assert law.opening(0.06, 0.0, 0.06, 0.0, True) == pytest.approx(0.4 * law.felt, rel=1e-9)
+    law.feel(1.0, 2.5e-3)
+    assert 0.0 < law.opening(0.06, 0.0, 0.06, 1.0, True) < 0.4  # a step of the wanted force comes smoothly

@@ -31,7 +31,7 @@ def plane(outline: Outline, pose: tuple[float, float, float], **more: float) -> 
 def test_a_rectangle_is_regrasped_once_and_held_parallel() -> None:
     hand, skills = plane(rectangle(30 * MM, 80 * MM, 2 * MM), (2 * MM, 4 * MM, 0.3))
     pose = list(hand.world.pose)
-    found = hand.run(skills.hold_parallel(0.5))
+    found = hand.run(skills.hold_parallel(1.5))
     assert (skills.regrasps, skills.rolls) == (1, 0) and hand.is_held()
     assert hand.truth().quality < 0.3 * DEG and found.force == pytest.approx(1.0, rel=0.05)
     assert math.hypot(hand.world.pose[0] - pose[0], hand.world.pose[1] - pose[1]) < 0.3 * MM  # nor has it been pushed

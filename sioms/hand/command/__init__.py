@@ -24,6 +24,8 @@ class Verb:
 
 
 VERBS: dict[str, Verb] = {
+    "friction": Verb("friction", "drag rubber over indenters in a simulated rig and fit the coefficients of friction"),
+    "reproduce": Verb("reproduce", "repeat the source's experiments in a simulated plane: source, ours, and why"),
     "trials": Verb("trials", "grasp random convex objects in a simulated plane and count what becomes of them"),
 }
 
