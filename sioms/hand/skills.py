@@ -87,6 +87,14 @@ class Skills:
         """
         return self._guarded("grasp", self._grasp())
 
+    def feel(self) -> Generator[Setpoint, Reading, Sensed]:
+        """Squeeze what is between both fingers already, and feel it.
+
+        Raises:
+            Failed: nothing is held, or as `grasp`.
+        """
+        return self._guarded("feel", self._feel())
+
     def regrasp(self, found: Sensed) -> Generator[Setpoint, Reading, Sensed]:
         """Open, go to the parallel grasp that `found` lets expect, close and feel again; raises as `grasp`."""
         return self._guarded("regrasp", self._regrasp(found))
@@ -149,6 +157,16 @@ class Skills:
                 "that leaves both free",
             )
         yield from self._close()
+        return (yield from self._squeeze())
+
+    def _feel(self) -> Generator[Setpoint, Reading, Sensed]:
+        self._check_sensors("feel object")
+        for i, finger in enumerate(self.now.fingers):
+            if not finger.touched:
+                raise Failed(
+                    Fault.NOTHING_THERE, f"feel object: finger {i + 1} touches nothing; want an object that was grasped"
+                )
+        self._held = True
         return (yield from self._squeeze())
 
     def _squeeze(self) -> Generator[Setpoint, Reading, Sensed]:

@@ -26,6 +26,13 @@ class Verb:
 VERBS: dict[str, Verb] = {
     "friction": Verb("friction", "drag rubber over indenters in a simulated rig and fit the coefficients of friction"),
     "reproduce": Verb("reproduce", "repeat the source's experiments in a simulated plane: source, ours, and why"),
+    "grasp": Verb("skill", "close on whatever is between the fingers, and feel it"),
+    "sense": Verb("skill", "feel what is held: friction angles, contacts, curvatures"),
+    "classify": Verb("skill", "tell whether what is held answers like a disk or like a rectangle"),
+    "regrasp": Verb("skill", "open, go to the parallel grasp that is expected, and close again"),
+    "roll": Verb("skill", "roll what is held until the grasp is parallel"),
+    "hold": Verb("skill", "hold for a time, and keep the grasp parallel by rolling"),
+    "release": Verb("skill", "open the hand"),
     "trials": Verb("trials", "grasp random convex objects in a simulated plane and count what becomes of them"),
 }
 

@@ -34,6 +34,8 @@ _MODE, _VELOCITY, _FORCE = (_NAMES.index(name) for name in ("control_mode", "vel
 _JOG = int(ControlMode.VELOCITY)
 _PRESS = int(ControlMode.FORCE)
 _NEW_S = 1.0
+MANNER = Manner(light_n=0.4)
+"""Light touches are a little firmer than on the plane: the platen holds an object against one finger with 0.2 N."""
 _BLIND = Felt(None)
 
 
@@ -51,8 +53,7 @@ class CellHand:
 
     Attributes:
         reading: the last one.
-        manner: how skills do it here: light touches are a little firmer than on the plane, because the platen holds
-            the object against one finger alone with up to 0.2 N.
+        manner: how skills do it here.
         seen: called with every reading and the set-point that answered it.
 
     Raises:
@@ -65,7 +66,7 @@ class CellHand:
         self, cell: Workcell, name: str = "hand", fingers: Sequence[str] = FINGERS, *, hand: Hand = Hand(),  # noqa: B008
         gains: Gains = Gains(), length_m: float = 20e-3, lease_s: float = LEASE_S,  # noqa: B008
     ) -> None:  # fmt: skip
-        self.hand, self.manner, self._length_m = hand, Manner(light_n=0.4), length_m
+        self.hand, self.manner, self._length_m = hand, MANNER, length_m
         self._follower = Follower(gains)
         self.seen: Callable[[Reading, Setpoint], None] | None = None
         with ExitStack() as stack:

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import math
 
 import pytest
 
 from sioms.hand.command import VERBS, add_parser, run
+from sioms.hand.command.skill import carry_out, lines
+from sioms.hand.plane import PlaneHand
+from sioms.hand.touch import Event, Failed, Fault, Manner
+from sioms.plant.outline import ellipse
+from sioms.plant.planar import Body
 
 
 def _words(*words: str) -> argparse.Namespace:
@@ -32,3 +38,27 @@ def test_trials_count_what_becomes_of_objects(capsys: pytest.CaptureFixture[str]
 def test_no_trials_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(_words("trials", "--count", "0")) == 1
     assert "want 1 or more" in capsys.readouterr().err
+
+
+def test_single_skills_follow_one_another_on_one_hand() -> None:
+    hand, events = PlaneHand(Body(ellipse(0.031, 0.022)), (0.002, -0.001, 0.4), seed=3), list[Event]()
+    with pytest.raises(Failed, match="touches nothing") as nothing:
+        carry_out(hand, "sense", Manner(), 1.0, events.append)
+    assert nothing.value.fault is Fault.NOTHING_THERE
+    first = carry_out(hand, "grasp", Manner(), 1.0, events.append)
+    assert first is not None and first.grasp.quality > math.radians(5.0)
+    again = carry_out(hand, "regrasp", Manner(), 1.0, events.append)
+    held = carry_out(hand, "hold", Manner(), 0.5, events.append)
+    assert again is not None and held is not None
+    assert held.grasp.quality < again.grasp.quality < 0.5 * first.grasp.quality
+    assert hand.truth().quality < math.radians(3.0)
+    assert any("regrasp" in event.text for event in events)
+    assert "friction angles" in lines(held)[0] and "finger 2" in lines(held)[-1]
+    assert carry_out(hand, "release", Manner(), 0.5, events.append) is None and not hand.is_held()
+
+
+def test_a_force_beyond_what_fingers_bear_is_refused_before_anything_is_opened(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert run(_words("grasp", "--force", "40")) == 1
+    assert "at most 4 N" in capsys.readouterr().err
