@@ -76,7 +76,7 @@ class SqueezeTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_o
     damper: float = 0.4
     spring_rate: float = 5.0
     spring: float = 100.0
-    filter_s: float = 0.02
+    filter_s: float = 0.05
     opening_max: float = 0.1
     contact_n: float = 0.02
     by: Literal["links", "carriages"] = "links"

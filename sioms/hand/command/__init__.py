@@ -26,6 +26,7 @@ class Verb:
 VERBS: dict[str, Verb] = {
     "friction": Verb("friction", "drag rubber over indenters in a simulated rig and fit the coefficients of friction"),
     "reproduce": Verb("reproduce", "repeat the source's experiments in a simulated plane: source, ours, and why"),
+    "demo": Verb("demo", "demonstrate grasp, regrasp, roll, hold, a knock and a dead finger on an unknown object"),
     "grasp": Verb("skill", "close on whatever is between the fingers, and feel it"),
     "sense": Verb("skill", "feel what is held: friction angles, contacts, curvatures"),
     "classify": Verb("skill", "tell whether what is held answers like a disk or like a rectangle"),

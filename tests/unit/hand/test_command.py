@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
+from pathlib import Path
 
 import pytest
 
 from sioms.hand.command import VERBS, add_parser, run
+from sioms.hand.command.canvas import HEIGHT, VIEW_M, WIDTH, drawn
+from sioms.hand.command.frames import Frame, Side
 from sioms.hand.command.skill import carry_out, lines
 from sioms.hand.plane import PlaneHand
 from sioms.hand.touch import Event, Failed, Fault, Manner
@@ -62,3 +66,32 @@ def test_a_force_beyond_what_fingers_bear_is_refused_before_anything_is_opened(
 ) -> None:
     assert run(_words("grasp", "--force", "40")) == 1
     assert "at most 4 N" in capsys.readouterr().err
+
+
+def test_the_demonstration_ends_as_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    assert run(_words("demo", "--quiet", "--no-animation", "-o", str(tmp_path))) == 0
+    out = capsys.readouterr().out
+    assert "regrasp" in out and "roll from" in out and "knocks" in out
+    worst = re.search(r"at most ([\d.]+) deg", out)
+    assert worst is not None and float(worst[1]) < 1.0
+    assert "it ended by itself: stale sensor" in out and "finger 2" in out.splitlines()[-2]
+    assert (tmp_path / "hand.png").stat().st_size > 20_000 and not (tmp_path / "hand.gif").exists()
+
+
+def test_a_frame_in_the_terminal_shows_object_fingers_and_forces() -> None:
+    outline = [(float(x), float(y)) for x, y in ellipse(0.031, 0.022).points]
+    sides = [
+        Side((sign * 0.043, 0.0), (sign * 0.043, sign * -0.14), (sign * 0.031, 0.0), 1.0, felt)
+        for sign, felt in ((-1, 1.0), (1, 0.5))
+    ]
+    frame = Frame(12.3, "hold", (0.0, 0.0, 0.0), (sides[0], sides[1]), (math.radians(2.0), math.nan), "a word")
+    rows = drawn(frame, outline)
+    assert len(rows) == HEIGHT + 3 and all(len(row) == WIDTH for row in rows[:HEIGHT])
+    middle = rows[HEIGHT // 2]
+    assert middle[WIDTH // 2] == " " and "hold" in rows[HEIGHT] and "2.00" in rows[HEIGHT] and "--" in rows[HEIGHT]
+    drawn_at = [column for column, char in enumerate(middle) if char != " "]
+    end = 0.0557 * WIDTH / VIEW_M  # the far side of a finger
+    assert abs(drawn_at[0] - (WIDTH / 2 - end)) < 2 and abs(drawn_at[-1] - (WIDTH / 2 + end)) < 2
+    one, two = re.findall(r"finger \d ([^ ]+)", rows[HEIGHT + 1])
+    assert one.count("█") > two.count("█") > 0
