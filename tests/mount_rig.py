@@ -5,6 +5,8 @@ from __future__ import annotations
 import contextlib
 import functools
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,8 +22,18 @@ def why_not() -> str:
     """Return why nothing can be mounted here; '' where something can."""
     if not os.access("/dev/fuse", os.R_OK | os.W_OK):
         return "no /dev/fuse, or no right to it"
+    if not _may_mount():
+        return "no right to mount, as in a container without CAP_SYS_ADMIN"
+    if os.geteuid() != 0 and shutil.which("fusermount3") is None:
+        return "no fusermount3"
     done = subprocess.run([sys.executable, "-c", "import mfusepy"], capture_output=True, text=True)
     return "" if not done.returncode else done.stderr.strip().splitlines()[-1]
+
+
+def _may_mount() -> bool:
+    """Tell whether any program may here, fusermount3 with root's rights too: CAP_SYS_ADMIN is in the bounding set."""
+    status = Path("/proc/self/status").read_text(encoding="utf-8")
+    return bool(int(re.findall(r"CapBnd:\s*(\w+)", status)[0], 16) >> 21 & 1)
 
 
 class Mount:
