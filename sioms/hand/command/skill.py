@@ -10,6 +10,7 @@ import argparse
 import math
 import sys
 from collections.abc import Callable, Generator
+from importlib import import_module
 from typing import Any, Protocol, TypeVar
 
 from sioms.hand.kinematics import Hand
@@ -52,6 +53,7 @@ def run(args: argparse.Namespace) -> int:
     from sioms.client.workcell import Workcell
     from sioms.hand.live.cell import MANNER, CellHand
 
+    import_module("sioms.hand.skills")  # takes longer than the hand's lease on a busy machine
     if not 0.0 < args.force <= MANNER.most_n:
         raise ValueError(f"squeeze with {args.force:g} N; want above 0 and at most {MANNER.most_n:g} N")
     if not 0.0 < args.time < math.inf:
