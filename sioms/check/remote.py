@@ -34,13 +34,15 @@ class Gateway:
     Args:
         daemon_socket: of the daemon.
         name: of the key that clients have.
+        host: where it listens; what this thread starts is on that host (``other_host``).
 
     Attributes:
         socket: the address, as that of a daemon.
         keys, own: folders of keys of the gateway and of the clients.
     """
 
-    def __init__(self, daemon_socket: str, name: str = "eva") -> None:
+    def __init__(self, daemon_socket: str, name: str = "eva", *, host: str = "127.0.0.1") -> None:
+        self.host = host
         self.folder = tempfile.mkdtemp(prefix="sioms-gateway-")
         self.keys, self.own = Folder(f"{self.folder}/cell"), Folder(f"{self.folder}/own")
         self.name, self._daemon_socket = name, daemon_socket
@@ -56,12 +58,12 @@ class Gateway:
         self.keys.allow(self.name, self.own.new(self.name).public, ("crew",))
 
     def _place(self) -> list[str]:
-        return ["--listen", f"127.0.0.1:{self.port}"]
+        return ["--listen", f"{self.host}:{self.port}"]
 
     def trusted(self, port: int) -> str:
         """Return the address of a port of this machine, at which this gateway's key is trusted from now on."""
-        self.own.trust(f"127.0.0.1:{port}", self.public)
-        return f"zmq://127.0.0.1:{port}"
+        self.own.trust(f"{self.host}:{port}", self.public)
+        return f"zmq://{self.host}:{port}"
 
     def start(self) -> None:
         """Start the process, which has not been started or has ended."""
@@ -90,19 +92,21 @@ class ZenohGateway(Gateway):
         number: of the certificate of the clients.
     """
 
-    def __init__(self, daemon_socket: str, name: str = "eva", authority: Folder | None = None) -> None:
+    def __init__(
+        self, daemon_socket: str, name: str = "eva", authority: Folder | None = None, *, host: str = "127.0.0.1"
+    ) -> None:
         from sioms.gateway import certificates
 
         self._certificates = certificates
         self._shared = authority
-        super().__init__(daemon_socket, name)
+        super().__init__(daemon_socket, name, host=host)
 
     def _keys(self) -> None:
         certificates = self._certificates
         self.authority = self._shared or Folder(f"{self.folder}/authority")
         if self._shared is None:
             certificates.new_authority(self.authority, "fleet", 1)
-        self.certify(self.keys, "cell", ("127.0.0.1",))
+        self.certify(self.keys, "cell", (self.host,))
         self.number = self.certify(self.own, self.name)
         self.keys.allow(self.name, self.number, ("crew",))
 
@@ -114,11 +118,11 @@ class ZenohGateway(Gateway):
         return made.number
 
     def _place(self) -> list[str]:
-        return ["--zenoh", f"127.0.0.1:{self.port}"]
+        return ["--zenoh", f"{self.host}:{self.port}"]
 
     def trusted(self, port: int) -> str:
         """Return the address of a port of this machine: the certificate vouches for whoever listens there."""
-        return f"zenoh://127.0.0.1:{port}"
+        return f"zenoh://{self.host}:{port}"
 
 
 class Relay:

@@ -38,6 +38,8 @@ STALE_S = 0.2
 FIRST_PINGS = 8
 STOP_AGAIN_S = 0.3
 """A stop that has not been answered on its own way goes the other one, too, after so long [s]."""
+BUSY_S = 6.0
+"""How long a gateway may take to begin a session, at least [s]: its machine, or this one, may have too much to do."""
 HELLO_AGAIN_S = 0.1
 """How often a greeting is repeated [s]: a transport may not have made our end of the link known yet."""
 _BUFFER = 1 << 19
@@ -105,7 +107,7 @@ def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock]:
     """
     scheme, host, port = place_of(address)
     what = f"connect to {printable(address)}"
-    deadline = time.monotonic() + timeout_s
+    deadline = time.monotonic() + max(timeout_s, BUSY_S)
     carrier: Link
     if scheme == "zmq":
         from .zeromq import ZmqLink
