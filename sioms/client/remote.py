@@ -404,7 +404,8 @@ class _Bridge:
             case Down.PONG:
                 self._compare(stamp_ns, body)
             case Down.END:
-                self._last_word = (channel or errno.EIO, printable(body.decode("utf-8", "replace"), 1024))
+                word = channel or errno.EIO, printable(body.decode("utf-8", "replace"), 1024)
+                self._last_word = self._last_word or word  # the first says why; what came in between gets another one
 
     def _drop_journals(self) -> None:
         for journal in self._journals.values():
