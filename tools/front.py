@@ -160,7 +160,8 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
     except ModuleNotFoundError as error:
         return _lacks(name, error)
     except OSError as error:
-        if error.errno in (errno.EBADF, errno.ENOSPC) and not error.filename:
+        plain = error.strerror == os.strerror(error.errno or 0)  # else a command has said what it could not write
+        if error.errno in (errno.EBADF, errno.ENOSPC) and not error.filename and plain:
             error.strerror = f"write standard output: {(error.strerror or '').lower()}"
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
             sys.stdout = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115  # nothing is flushed at exit

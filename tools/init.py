@@ -12,6 +12,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from sioms.whole_file import write_whole
 from sioms.wording import did_you_mean
 
 from .driver import drivers, page_of
@@ -75,9 +76,9 @@ def run(args: argparse.Namespace) -> int:
         text += "".join(_block(port, i) for i, port in enumerate(ports))
         told = _told(ports)
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
-        raise OSError(error.errno, f"write {path}: {error.strerror}; give a FILE in an existing folder") from None
+        raise OSError(error.errno, f"{error.strerror}; give a FILE in an existing folder with room for it") from None
     print(f"{path} written{told}")
     status = check(path)
     if status == 0:

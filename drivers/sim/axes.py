@@ -160,7 +160,7 @@ class SimAxes(TickDriver):
         inputs = tuple(dict.fromkeys(axis.load_node for axis in axes if axis.load_node))
         return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
-    make_up_ns: ClassVar[int] = 5_000_000
+    make_up_ns: ClassVar[int] = 20_000_000
     """How long a tick may make up for turns [ns]: a machine that is too slow for them shows its axes in slow motion."""
 
     def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
@@ -230,6 +230,8 @@ class SimAxes(TickDriver):
             self._last_ns += max(0, (now_ns - self._last_ns) // self._tick_ns - 1) * self._tick_ns
             self._is_still = False
         behind = round((now_ns - self._last_ns) / self._tick_ns) if self._command is not None else 0
+        if behind > self._stride and self.is_at_rest():  # nor do those that were missed
+            self._last_ns, behind, self._is_still = self._last_ns + (behind - 1) * self._tick_ns, 1, False
         if now_ns - self._last_ns <= self._late_ns and behind > self._stride:
             behind = self._make_up(behind)
         late = behind > self._stride and now_ns - self._last_ns <= self._late_ns

@@ -29,6 +29,7 @@ from sioms.tactile.identify import series_of
 from sioms.tactile.linearity import linearise
 from sioms.tactile.quality import Load, ShapeEstimate
 from sioms.tactile.touches import Recording, Touches, join, ramps_of
+from sioms.whole_file import write_whole
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +54,7 @@ def calibrate(args: argparse.Namespace) -> int:
                 f"{report}; record again, or write it all the same with --doubtful"
             )
         finger = msgspec.structs.replace(finger, notes={**finger.notes, "doubts": "; ".join(result.doubts)})
-    args.output.write_text(to_toml(finger), encoding="utf-8")
+    write_whole(args.output, to_toml(finger))
     from_toml(args.output.read_text(encoding="utf-8"))  # what was written can be read
     write_report(data, result, report, progress)
     progress.close()

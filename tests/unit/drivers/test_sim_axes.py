@@ -138,6 +138,7 @@ def test_late_ticks_cost_the_world_no_time(bench):
     """The plant falls freely for the whole time, also when ticks were skipped."""
     axis = SERVO | {"motor": {"mass": 1.0, "load_force": 1.0}, "k": 0.0}
     mod = bench.make(SimAxes, "mod0", {"axis": [axis]})
+    mod.make_up_ns = 10**12
     bench.run(0.005)
     bench.clock_ns += 20_000_000
     bench.run(0.005)
@@ -277,6 +278,7 @@ def test_a_starved_machine_moves_as_a_free_one(bench, bandwidth_hz):
         "acceleration_max": 6.0,
     }
     mod = bench.make(SimAxes, "mod0", {"axis": [axis, axis | {"name": "y"}]})
+    mod.make_up_ns = 10**12
     bench.run(0.01)
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.3)
     random, now_ns, worst = np.random.default_rng(1), bench.clock_ns, 0.0
@@ -349,3 +351,16 @@ def test_a_machine_that_is_too_slow_shows_its_axes_in_slow_motion_and_ends_each_
     assert mod.blocks[0].stamp_ns == 0, "of the tick again"
     went = float(mod.bank.rows["commanded_position"][0]) - began
     assert went == pytest.approx(0.1 * (bench.clock_ns - began_ns) * 1e-9, rel=1e-6)
+
+
+def test_a_world_that_is_late_and_at_rest_has_nothing_to_make_up_for(bench):
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO], "late_max_s": 30.0})
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.02)
+    bench.run(2.0, until=lambda: mod.bank.is_idle([0]))
+    bench.run(0.5)
+    mod.make_up_ns = 0
+    bench.clock_ns += 5_000_000_000
+    bench.run(0.003)
+    assert mod.blocks[0].stamp_ns == 0, "it is not late any more"
+    assert mod.bank.rows["position"][0] == pytest.approx(0.02, abs=1e-4)
