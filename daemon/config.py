@@ -72,6 +72,7 @@ class DeviceTable(msgspec.Struct, frozen=True):
     hang_s: Seconds = 1.0
     lease_s: Seconds | None = None
     user: str = ""
+    process: Annotated[str, Meta(pattern="^[A-Za-z0-9_.-]{0,32}$")] = ""
 
 
 class NodeTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -163,6 +164,16 @@ class Config(msgspec.Struct, frozen=True):
         """Return where drivers keep what outlives them, '' when nowhere; systemd tells it in $STATE_DIRECTORY."""
         named = self.workcell.state_folder or environment.get("STATE_DIRECTORY", "").split(":")[0]
         return os.path.join(self.folder, named) if named else ""
+
+    def process_of(self, device: str) -> str:
+        """Return what is one for all devices of one process."""
+        name = self.devices[device].common.process
+        return f"process {name}" if name else f"device {device}"
+
+    @property
+    def processes(self) -> list[str]:
+        """Return all that ``process_of`` returns, in the order of the devices."""
+        return list(dict.fromkeys(map(self.process_of, self.devices)))
 
 
 _SECTIONS = ("workcell", "quota", "device", "node", "grant", "emergency_stop", "alarm")

@@ -6,6 +6,7 @@ import errno
 import fcntl
 import mmap
 import os
+import select
 import signal
 import socket
 import time
@@ -32,6 +33,8 @@ from .restarts import Restarts
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | 0x0010 | fcntl.F_SEAL_SEAL  # 0x10: F_SEAL_FUTURE_WRITE
 _SHUTDOWN_S = 3.0
+_ALONE_S = 0.02
+"""A process closes the sockets of its devices so long before it has ended, at most [s]."""
 LOOK_NS = 1_000_000_000
 """How often a driver that is starting is looked at."""
 
@@ -111,6 +114,7 @@ class DriverProcess:
         self._owner = owner
         self._log = log
         self._sock: socket.socket | None = None
+        self._is_heard = False
         self._pidfd = -1
         self._dying: set[int] = set()
         self._then: Callable[[], None] | None = None
@@ -123,6 +127,11 @@ class DriverProcess:
     def name(self) -> str:
         """Device name."""
         return self.device.name
+
+    @property
+    def process(self) -> str:
+        """Name of the process that it shares with other devices; empty: it has one of its own."""
+        return self.device.common.process
 
     @property
     def is_there(self) -> bool:
@@ -165,9 +174,11 @@ class DriverProcess:
             self.options,
             realtime_priority=self.device.common.realtime_priority,
             user=self.device.common.user,
+            process=self.process,
             lease_s=self._lease_s,
             stopped=self._owner.stopped_of(self.name),
         )
+        self._is_heard = True
         self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once
         with theirs:
             try:
@@ -181,7 +192,7 @@ class DriverProcess:
     def _spawned(self, generation: int, pid: Any, errno_: int, text: str, fds: list[int]) -> None:
         if self._sock is None or generation != self.generation:  # ended while the fork server was forking
             for fd in fds:
-                self._bury(fd)
+                self._part(fd)
         elif errno_:
             self._end(f"its process could not be started: {text}")
         elif not fds:  # the kernel drops what goes beyond the limit; the process ends with its control socket
@@ -191,6 +202,13 @@ class DriverProcess:
             self._patience = Patience(pid)
             self._patience.renew(time.monotonic())
             self._loop.watch(self._pidfd, self._exited)
+
+    def _part(self, pidfd: int) -> None:
+        """Have done with a process that has ended, or has closed its socket: kill it, unless it has other devices."""
+        if self.process:
+            os.close(pidfd)
+        else:
+            self._bury(pidfd)
 
     def _bury(self, pidfd: int) -> None:
         """Kill a process and see it gone: until then it may hold the device."""
@@ -293,7 +311,21 @@ class DriverProcess:
         self._timer = self._loop.after(_SHUTDOWN_S, lambda: self.kill("it did not end when asked to"))
 
     def _receive(self) -> None:
-        if self._sock is not None and self._take() is False:
+        if self._sock is None or self._take() is not False:
+            return
+        if self.process and self._pidfd >= 0:  # whether it has ended alone, the end of the process will tell, or not
+            self._unwatch(self._sock)
+            self._loop.after(_ALONE_S, partial(self._ended_alone, self.generation))
+            return
+        self._exited()
+
+    def _unwatch(self, sock: socket.socket) -> None:
+        if self._is_heard:
+            self._is_heard = False
+            self._loop.unwatch(sock.fileno())
+
+    def _ended_alone(self, generation: int) -> None:
+        if generation == self.generation:
             self._exited()
 
     def _take(self) -> bool | None:
@@ -351,10 +383,22 @@ class DriverProcess:
         if self._sock is None:
             return
         # A driver that closed its control socket has no business living on.
-        self._end(self.reason or "its driver process ended")
+        self._end(self.reason or self._why_ended(), self._part)
 
-    def _end(self, reason: str) -> None:
-        """Clear everything of the present process, tell the owner, and plan the restart."""
+    def _why_ended(self) -> str:
+        if not self.process:
+            return "its driver process ended"
+        if self._pidfd >= 0 and select.select([self._pidfd], [], [], 0)[0]:
+            return f"process {self.process} ended, and with it every device in it"
+        return f"its driver ended, in process {self.process}"
+
+    def _end(self, reason: str, part: Callable[[int], None] | None = None) -> None:
+        """Clear everything of the present process, tell the owner, and plan the restart.
+
+        Args:
+            reason: why, for who asks.
+            part: what becomes of the process, by its pidfd; None: it is killed.
+        """
         if self._sock is None:
             return
         for mapping in self._maps:
@@ -365,12 +409,12 @@ class DriverProcess:
         for fd in self.page_fds:
             os.close(fd)
         self.page_fds = []
-        self._loop.unwatch(self._sock.fileno())
+        self._unwatch(self._sock)
         self._sock.close()
         self._sock = None
         if self._pidfd >= 0:
             self._loop.unwatch(self._pidfd)
-            self._bury(self._pidfd)
+            (part or self._bury)(self._pidfd)
             self._pidfd = -1
         self._patience = None  # the next process is not to blame for what this one did
         self._lost(reason)

@@ -11,7 +11,7 @@ import pwd
 import stat
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -209,6 +209,7 @@ class Loader:
         # Names of devices that failed would only be missed again as targets of aliases.
         names = NameTable({n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes)
         self._errors += _unknown_users(self._config) + shared_claims(names.devices.values())
+        self._errors += _not_together(names.devices, self._config)
         sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
             self._errors += names.errors
@@ -308,6 +309,29 @@ def _unknown_users(config: Config) -> list[str]:
         except KeyError:
             errors.append(f"[device.{name}]: user = {device.common.user}: no such user; create it or name another")
     return errors
+
+
+def _not_together(devices: Mapping[str, DeviceInfo], config: Config) -> Iterator[str]:
+    """Tell the devices that cannot share the process that they shall, for a line of their own or as another's."""
+    firsts: dict[str, tuple[str, dict[str, object]]] = {}
+    for name, info in devices.items():
+        common = config.devices[name].common
+        if not common.process:
+            continue
+        if info.kind in ("line", "stream"):
+            yield (
+                f"[device.{name}]: process = {common.process}: its driver has a line; want a process of its own, or a "
+                "driver without one, as those of simulated devices"
+            )
+        priority = info.realtime_priority if common.realtime_priority is None else common.realtime_priority
+        wanted: dict[str, object] = {"user": common.user or "none", "realtime_priority": priority}
+        first, there = firsts.setdefault(common.process, (name, wanted))
+        for key in wanted:
+            if wanted[key] != there[key]:
+                yield (
+                    f"[device.{name}]: {key} = {wanted[key]} in process {common.process}, where that of device {first} "
+                    f"is {there[key]}; want the same"
+                )
 
 
 def _tell(done: Callable[[Plan | None, list[str]], None], plan: Plan | None, errors: list[str]) -> None:

@@ -121,6 +121,20 @@ def shortages(needs: Mapping[str, float], realtime: Iterable[str], machine: Mach
     return found
 
 
+def crowded(needs: Mapping[str, float], config: Config) -> list[str]:
+    """Return a sentence for each process of several devices that needs more than one processor."""
+    found = []
+    for process in sorted({device.common.process for device in config.devices.values()} - {""}):
+        inside = {name: each for name, each in needs.items() if config.devices[name].common.process == process}
+        total = sum(inside.values())
+        if total > 1.0 and len(inside) > 1:
+            found.append(
+                f"process {process} needs about {total:.2f} processors, and can use one: {_greediest(inside)}; "
+                "give some of its devices another process"
+            )
+    return found
+
+
 def realtime_devices(devices: Mapping[str, DeviceInfo], config: Config) -> list[str]:
     """Return the names of the devices whose drivers ask for a real-time class."""
     found = []
@@ -134,7 +148,8 @@ def realtime_devices(devices: Mapping[str, DeviceInfo], config: Config) -> list[
 def told(devices: Mapping[str, DeviceInfo], config: Config, machine: Machine) -> tuple[str, list[str]]:
     """Return what the drivers of a configuration need, and why that does not fit on a machine, where it does not."""
     needs = {name: need(info) for name, info in devices.items()}
-    return summary(needs, machine), shortages(needs, realtime_devices(devices, config), machine)
+    found = shortages(needs, realtime_devices(devices, config), machine)
+    return summary(needs, machine), found + crowded(needs, config)
 
 
 def _processors(machine: Machine) -> str:

@@ -461,8 +461,9 @@ class Server:
             "daemon_lease_s": plan.config.workcell.daemon_lease_s,
             "folder": plan.config.folder,
             "state_folder": plan.config.state_folder(os.environ),
-            # Golden-ratio steps: however many drivers there are, their ticks do not fall together.
-            "phase": (list(plan.config.devices).index(name) * 0.6180339887) % 1.0,
+            # Golden-ratio steps: however many drivers there are, their ticks do not fall together. Those of one process
+            # do: they need one wake.
+            "phase": (plan.config.processes.index(plan.config.process_of(name)) * 0.6180339887) % 1.0,
         }
 
     def _start(self, name: str) -> None:
@@ -550,7 +551,7 @@ class Server:
 
     def _look_at_budget(self) -> None:
         self.log.tell_suppressed()
-        use = realtime_use({device.name: device.pid for device in self.devices.values()})
+        use = realtime_use({device.process or device.name: device.pid for device in self.devices.values()})
         self.look_at_use()  # a driver may not have taken what it was told
         if greedy := self._budget.look(time.monotonic(), use):
             make_ordinary(greedy[1])

@@ -245,7 +245,7 @@ class World:
                 runtime.statistics,
             )  # fmt: skip
 
-    def _wait_for(self, poll: int, ready: Any) -> int:
+    def _wait_for(self, poll: int, ready: Any, timeout_ms: int) -> int:
         """Say that a timer is due, until that has been heard; then that a signal has ended the wait."""
         assert self._run is not None
         ready[0] = 1 if self.runtime._timer.expired else 2  # type: ignore[attr-defined]
@@ -254,14 +254,13 @@ class World:
     def _tick_quietly(self) -> bool:
         """Tick by steps; False when the tick is the loop's."""
         runtime = self.runtime
-        if self._run is None or (runtime._line_due_ns is not None and not runtime._announced):
+        runtime._quiet = self._run
+        quiet = runtime.lend()
+        if quiet is None:
             return False
-        watched = bool(runtime.clients.handles) or runtime._is_used
-        ready = self._run.wait(runtime._scheduled_ns, runtime.tick, watched, runtime._announced, runtime._slack_ns)
-        if ready is None:
-            return False
-        runtime._resume(self._run.record)
-        self.quiet += self._run.record.done
+        quiet.run()
+        ready = runtime.take_back(quiet)
+        self.quiet += quiet.record.done
         return not ready
 
     def turn(self, *, calm: bool = False) -> None:

@@ -145,6 +145,10 @@ class SimAxes(TickDriver):
         if not settings.axis:
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
         _build(settings)
+        return cls._describe(settings)
+
+    @staticmethod
+    def _describe(settings: SimAxesSettings) -> Description:
         axes = _axes(settings)
         beams = len(_boxes(settings))
         blocks = [
@@ -165,7 +169,7 @@ class SimAxes(TickDriver):
 
     def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        axes, plant, *port = self.describe(name, settings).blocks
+        axes, plant, *port = self._describe(settings).blocks
         self._servos, self._steppers, configured = _build(settings)
         self._tick_ns = round(1e9 / settings.tick_hz)
         self.bank = AxisBank(
@@ -373,7 +377,8 @@ class QuietAxes:
         self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
         plant, motors, steppers = self._plant, driver._servos, driver._steppers
         self.record = SimulatedAxes(
-            period_ns=driver._tick_ns, ahead=0, last_ns=0, found=0, may_rest=0, still=0, seen=driver._seen,
+            period_ns=driver._tick_ns, late_ns=driver._late_ns, stride=driver._stride, ahead=0, last_ns=0, found=0,
+            may_rest=0, still=0, seen=driver._seen,
             near=driver._near, loop=driver.bank.loop,
             motors=motors.record if motors else Motors.empty(),
             steppers=steppers.record if steppers else Steppers.empty(),

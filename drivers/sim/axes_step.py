@@ -19,13 +19,16 @@ UNDONE: Final = LATE | ENDS | NOT_FINITE | WIDE | ODD
 class SimulatedAxes(Record):
     """Servos over simulated motors and steppers, each a row of the loop.
 
-    ``ahead``: the world has gone on to the next tick; ``last_ns``: its time. ``may_rest``: axes are at rest when the
-    world is; ``still``: they are, and ticks that are left out change nothing. ``seen``: the command of the tick before,
-    and how ``near`` the next must be to be the same. ``found`` by the bank in a tick that is half done. ``data`` and
-    ``flags`` of the plant, as they are and as ``shown`` less the ``offset``.
+    ``ahead``: by how many ticks the world has gone on; ``last_ns``: the time of the last one; ``stride``: how many may
+    be made up for at once, up to ``late_ns``. ``may_rest``: axes are at rest when the world is; ``still``: they are,
+    and ticks that are left out change nothing. ``seen``: the command of the tick before, and how ``near`` the next must
+    be to be the same. ``found`` by the bank in a tick that is half done. ``data`` and ``flags`` of the plant, as they
+    are and as ``shown`` less the ``offset``.
     """
 
     period_ns: int
+    late_ns: int
+    stride: int
     ahead: int
     last_ns: int
     found: int
@@ -50,10 +53,47 @@ class SimulatedAxes(Record):
 
 @step
 def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
-    """Measure, command, publish. Returns what the driver has to see to, 0 for nothing."""
-    left_out = max(0, int((now_ns - s.last_ns) / s.period_ns) - 1) if s.still else 0
-    if now_ns - s.last_ns != (left_out + 1) * s.period_ns or advance_axes(s, 0, 0, 0):
+    """Measure, command, publish; ticks that were missed are made up for. Returns what the driver has to see to, 0 for
+    nothing.
+    """
+    behind = int((now_ns - s.last_ns) / s.period_ns)
+    if behind < 1 or behind * s.period_ns != now_ns - s.last_ns or now_ns - s.last_ns > s.late_ns:
         return NOT_READY
+    if s.still:  # what was left out changes nothing
+        s.last_ns += (behind - 1) * s.period_ns
+        behind = 1
+    while behind > s.stride:
+        found = turn_axes(s, s.last_ns + s.stride * s.period_ns, s.stride)
+        if found:
+            return found
+        behind -= s.stride
+    found = turn_axes(s, now_ns, behind)
+    if found:
+        return found
+    s.instants[OUTPUTS] = clock_ns()
+    m = s.motors
+    p = s.steppers
+    for j in range(m.n):
+        s.data[2 * s.motor_rows[j]] = m.position[j]
+        s.data[2 * s.motor_rows[j] + 1] = m.contact_force[j]
+    for j in range(p.n):
+        s.data[2 * s.stepper_rows[j]] = p.position[j]
+    for i in range(2 * s.loop.n):
+        s.shown[i] = s.data[i] - s.offset[i]
+        s.shown_flags[i] = s.flags[i]
+    s.axes.words[ALIVE] = s.instants[OUTPUTS]
+    s.plant.words[ALIVE] = s.instants[OUTPUTS]
+    publish(s.axes, now_ns, number, as_of_ns)
+    publish(s.plant, now_ns, number, as_of_ns)
+    return 0
+
+
+@step
+def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int) -> int:
+    """Let the world go on by some ticks up to now under the last command, measure, and command anew."""
+    while s.ahead < ticks:
+        if move_axes(s):
+            return NOT_READY
     loop = s.loop
     m = s.motors
     p = s.steppers
@@ -72,31 +112,20 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     s.still = 0
     s.last_ns = now_ns
     s.found = found
-    if found:
-        return found
-    s.instants[OUTPUTS] = clock_ns()
-    for j in range(m.n):
-        s.data[2 * s.motor_rows[j]] = m.position[j]
-        s.data[2 * s.motor_rows[j] + 1] = m.contact_force[j]
-    for j in range(p.n):
-        s.data[2 * s.stepper_rows[j]] = p.position[j]
-    for i in range(2 * loop.n):
-        s.shown[i] = s.data[i] - s.offset[i]
-        s.shown_flags[i] = s.flags[i]
-    s.axes.words[ALIVE] = s.instants[OUTPUTS]
-    s.plant.words[ALIVE] = s.instants[OUTPUTS]
-    publish(s.axes, now_ns, number, as_of_ns)
-    publish(s.plant, now_ns, number, as_of_ns)
-    return 0
+    return found
 
 
 @step
 def advance_axes(s: SimulatedAxes, now_ns: int, until_ns: int, unused: int) -> int:
     """Let the world go on to the next tick. Returns 1 when that takes more than free motion."""
+    return 0 if s.ahead else move_axes(s)
+
+
+@step
+def move_axes(s: SimulatedAxes) -> int:
+    """Let the world go on by a tick. Returns 1 when that takes more than free motion."""
     m = s.motors
     p = s.steppers
-    if s.ahead:
-        return 0
     if m.n:
         for j in range(m.n):
             m.command[j] = s.loop.actuator[s.motor_rows[j]]
@@ -108,7 +137,7 @@ def advance_axes(s: SimulatedAxes, now_ns: int, until_ns: int, unused: int) -> i
         for j in range(p.n):
             p.goal[j] = s.loop.actuator[s.stepper_rows[j]]
         turn(p)
-    s.ahead = 1
+    s.ahead += 1
     return 0
 
 

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import weakref
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -162,6 +163,12 @@ class Record:
                 self.__dict__[field] = value  # it lives as long as what points to it
                 setattr(self.made, field, _address(value))
 
+    @property
+    def address(self) -> int:
+        """A number by which steps find the record in an array of such, as long as it is kept elsewhere."""
+        _records[number := self.pointer if library is not None else id(self)] = self
+        return number
+
     @classmethod
     def empty(cls) -> Self:
         """Return a record of nothing: numbers 0, arrays without elements."""
@@ -172,6 +179,14 @@ class Record:
             else:
                 fields[name] = kind(0) if kind in NUMBERS else kind.empty()
         return cls(**fields)
+
+
+_records: weakref.WeakValueDictionary[int, Record] = weakref.WeakValueDictionary()
+
+
+def record_of(address: int) -> Record:
+    """Return the record that has an address."""
+    return _records[address]
 
 
 class _Number:

@@ -7,7 +7,7 @@ import os
 import select
 import time
 
-from .language import Integers
+from .language import Context, Integers, record_of
 
 MOST_EVENTS = 64
 
@@ -19,14 +19,16 @@ static inline int64_t sioms_clock_ns(void)
     return (int64_t)now.tv_sec * 1000000000 + now.tv_nsec;
 }
 
-static inline int64_t sioms_wait_for(int64_t poll, int64_t *ready)
+static inline int64_t sioms_wait_for(int64_t poll, int64_t *ready, int64_t timeout_ms)
 {
     struct epoll_event events[64];
-    int count = epoll_wait((int)poll, events, 64, -1);
+    int count = epoll_wait((int)poll, events, 64, (int)timeout_ms);
     for (int i = 0; i < count; i++)
         ready[i] = events[i].data.fd;
     return count < 0 ? 0 : count;
 }
+
+static inline void *sioms_record_at(int64_t address) { return (void *)address; }
 
 static inline int64_t sioms_expirations(int64_t timer)
 {
@@ -59,16 +61,22 @@ def clock_ns() -> int:
     return time.monotonic_ns()
 
 
-def wait_for(poll: int, ready: Integers) -> int:
-    """Wait for events of an epoll; write the descriptors that are ready into an array, return how many.
+def wait_for(poll: int, ready: Integers, timeout_ms: int) -> int:
+    """Wait for events of an epoll, at most so long [ms], below 0 for ever; write the descriptors that are ready into an
+    array, return how many.
 
     A signal ends the wait, too: none is ready then.
     """
     found = _polls.setdefault(poll, select.epoll.fromfd(poll)) if poll not in _polls else _polls[poll]
-    events = found.poll(maxevents=MOST_EVENTS)
+    events = found.poll(timeout_ms * 1e-3 if timeout_ms >= 0 else None, maxevents=MOST_EVENTS)
     for i, (fd, _) in enumerate(events):
         ready[i] = fd
     return len(events)
+
+
+def record_at(address: int) -> Context:
+    """Return the record that has an address, see ``Record.address``."""
+    return record_of(address)  # type: ignore[return-value]  # any record is
 
 
 def expirations(timer: int) -> int:

@@ -105,7 +105,6 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     """
     kind = driver.Settings
     table = dict(_anchored(table, folder))
-    known = field_names(kind)
     errors = []
     # The validator names one error; all are looked for only when there is one.
     top = [field.encode_name for field in msgspec.structs.fields(kind)]
@@ -115,7 +114,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     try:
         return msgspec.convert(table, kind), errors
     except msgspec.ValidationError as error:
-        return None, errors + (every_error("", table, kind) or [explain("", error, known, choices(kind))])
+        return None, errors + (every_error("", table, kind) or [explain("", error, field_names(kind), choices(kind))])
 
 
 def _anchored(value: Any, folder: str, key: str = "") -> Any:

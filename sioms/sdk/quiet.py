@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class QuietRun:
-    """Waits, and ticks by steps.
+    """Ticks by steps while the process waits.
 
     Args:
         steps: the driver's.
@@ -41,9 +41,9 @@ class QuietRun:
         pages, stops, waits, clients, statistics: parts of the process.
 
     Attributes:
-        record: after ``wait``: ``done`` ticks, ``expired`` when the timer has been read and the tick is the loop's,
-            ``slackens`` when the slack of the last tick is, ``announced`` when the slack of the next one is done, and
-            what is ``told``.
+        record: after ``take_back``: ``done`` ticks, ``expired`` when the timer has been read and the tick is the
+            loop's, ``slackens`` when the slack of the last tick is, ``announced`` when the slack of the next one is
+            done, and what is ``told``.
     """
 
     def __init__(
@@ -60,38 +60,45 @@ class QuietRun:
             orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
             announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
             tick=steps.tick, slack=steps.slack, rest=steps.rest, instants=instants, scheduled_ns=0, began_ns=0,
-            number=0, done=0, expired=0, slackens=0, ring=statistics.ring.reshape(-1), ticks=0, longest_ns=0,
+            number=0, waiting=0, done=0, expired=0, slackens=0, ring=statistics.ring.reshape(-1), ticks=0, skipped=0,
+            longest_ns=0,
         )  # fmt: skip
 
-    def wait(
-        self, scheduled_ns: int, number: int, watched: bool, announced: int = 0, worked_ns: int = 0
-    ) -> list[int] | None:
-        """Wait for events, and tick meanwhile.
+    def lend(self, scheduled_ns: int, number: int, watched: bool, announced: int = 0, worked_ns: int = 0) -> bool:
+        """Let steps tick from now on, until ``take_back``; return False when the loop has to.
 
         Args:
             scheduled_ns, number: of the last tick.
             watched: whether somebody looks at the device.
             announced, worked_ns: whether the slack of the next tick is done, and how long that took [ns].
-
-        Returns:
-            descriptors that are ready; None, and nothing has been waited for, when the loop has to tick.
         """
         record, statistics, idling = self.record, self._statistics, self._idling
         until_ns = self._waits.until_ns()
         if not until_ns or not self._steps.is_ready(watched) or not self._pages.lend():
-            return None
+            return False
         record.until_ns = min(until_ns, self._clients.until_ns())
         record.stopped, record.resets, record.orders = self._stops.seen
         record.scheduled_ns, record.number = scheduled_ns, number
         record.watched, record.periods, record.restless_ns = watched, idling.periods, idling.restless_ns
         record.announced, record.worked_ns = announced, worked_ns
         record.ticks, record.longest_ns = statistics.ticks, statistics.longest_ns
-        count = run(record)
+        record.skipped = statistics.skipped
+        record.waiting = record.done = record.expired = record.slackens = record.told = 0
+        return True
+
+    def run(self) -> None:
+        """Wait for events, and tick meanwhile; between ``lend`` and ``take_back``."""
+        run(self.record)
+
+    def take_back(self) -> list[int]:
+        """Go on from where the steps have come; return the descriptors that are ready."""
+        record, statistics = self.record, self._statistics
         statistics.ticks, statistics.longest_ns = record.ticks, record.longest_ns
-        idling.restless_ns = record.restless_ns
+        statistics.skipped = record.skipped
+        self._idling.restless_ns = record.restless_ns
         self._pages.take_back()
         self._steps.resume()
-        ready: list[int] = self._ready[:count].tolist()
+        ready: list[int] = self._ready[: record.waiting].tolist()
         return ready
 
 

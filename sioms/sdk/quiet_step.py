@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from sioms.native.language import Call, Context, Integers, Record, step
-from sioms.native.system import clock_ns, expirations, fence, set_timer, wait_for, wake
+from sioms.native.system import clock_ns, expirations, fence, record_at, set_timer, wait_for, wake
 
 STOPPED: Final = 0
 RESETS: Final = 1
@@ -69,8 +69,9 @@ class Quiet(Record):
     its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
     else it is idle when it has been at rest for ``rest_ns`` since ``restless_ns``, and ``told`` is RESTED or STIRS.
 
-    ``scheduled_ns``, ``began_ns`` and ``number`` of the last tick; ``done`` ticks of this run; ``expired``: the timer
-    has been read, and the tick is the loop's; ``slackens``: the loop has to do the slack of the last tick. ``ring`` of
+    ``scheduled_ns``, ``began_ns`` and ``number`` of the last tick. Since the loop has waited: ``done`` ticks;
+    ``waiting``, how many descriptors are ``ready`` for the loop; ``expired``: the timer has been read, and the tick is
+    the loop's; ``slackens``: the loop has to do the slack of the last tick. ``ring`` of
     the statistics.
     """
 
@@ -101,11 +102,13 @@ class Quiet(Record):
     scheduled_ns: int
     began_ns: int
     number: int
+    waiting: int
     done: int
     expired: int
     slackens: int
     ring: Integers
     ticks: int
+    skipped: int
     longest_ns: int
 
 
@@ -159,11 +162,13 @@ def one_tick(q: Quiet) -> int:
         return LEFT
     if began_ns - q.latch[DAEMON_ALIVE] > q.daemon_lease_ns or began_ns >= q.until_ns:
         return LEFT
-    scheduled_ns = q.scheduled_ns + q.period_ns * q.periods
+    count = q.announced if q.announced else q.expired
+    scheduled_ns = q.scheduled_ns + count * q.period_ns * q.periods
     if q.tick(q.device, scheduled_ns, began_ns, q.number + 1):
         return LEFT
     q.expired = 0
     q.announced = 0
+    q.skipped += (count - 1) * q.periods
     q.scheduled_ns = scheduled_ns
     q.began_ns = began_ns
     q.number += 1
@@ -193,12 +198,12 @@ def look_at_rest(q: Quiet, now_ns: int) -> int:
 @step
 def announce(q: Quiet) -> int:
     """Do the slack of a tick before it, and have the other timer begin it; return what has become of this one."""
-    due_ns = q.scheduled_ns + q.period_ns
+    due_ns = q.scheduled_ns + (q.announced + q.expired) * q.period_ns
     began_ns = clock_ns()
-    if q.announced or q.slack(q.device, began_ns, due_ns, 0):
+    if q.slack(q.device, began_ns, due_ns, 0):
         return LEFT
+    q.announced += q.expired
     q.expired = 0
-    q.announced = 1
     q.worked_ns = clock_ns() - began_ns
     set_timer(q.line_timer, due_ns)
     return DONE
@@ -211,25 +216,65 @@ def heed_timer(q: Quiet, fd: int) -> int:
         q.expired = expirations(q.timer)
         if q.expired == 0:
             return DONE
-        if q.expired != 1:
-            return LEFT
         return announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
-    if fd == q.line_timer and q.announced == 1:
+    if fd == q.line_timer and q.announced:
         return one_tick(q) if expirations(q.line_timer) else DONE
     return LEFT
 
 
 @step
+def heed(q: Quiet, count: int) -> int:
+    """Do what some descriptors that are ready ask for, as far as it is ticks; return whether the loop has to go on."""
+    q.waiting = count
+    if count != 1:
+        return 1
+    found = heed_timer(q, q.ready[0])
+    q.waiting = 1 if found == LEFT else 0
+    return found
+
+
+@step
 def run(q: Quiet) -> int:
-    """Wait and tick; return how many descriptors are ready for the loop."""
-    q.done = 0
-    q.expired = 0
-    q.slackens = 0
-    q.told = 0
+    """Wait and tick until the loop has to go on."""
+    while not heed(q, wait_for(q.poll, q.ready, -1)):
+        pass
+    return q.waiting
+
+
+class Many(Record):
+    """Several devices in one process: ``poll`` of their polls, how long to wait for one, and, by the descriptor of
+    each, the address ``of`` its Quiet, 0 where the loop has it; below ``size``. ``heed`` is the step ``heed_one``.
+    """
+
+    poll: int
+    ready: Integers
+    timeout_ms: int
+    of: Integers
+    size: int
+    heed: Call
+
+
+@step
+def heed_one(q: Quiet, a: int, b: int, c: int) -> int:
+    """Do what is ready of one device; return whether its loop has to go on."""
+    count = wait_for(q.poll, q.ready, 0)
+    return heed(q, count) if count else 0
+
+
+@step
+def run_many(m: Many) -> int:
+    """Wait, and tick the devices, until the loops of some have to go on; return of how many, which are ``ready``.
+
+    None is when a time-out is over in which nothing else was due, or after a signal.
+    """
     while True:
-        count = wait_for(q.poll, q.ready)
-        if count != 1:
-            return count
-        found = heed_timer(q, q.ready[0])
-        if found:
-            return 1 if found == LEFT else 0
+        count = wait_for(m.poll, m.ready, m.timeout_ms)
+        left = 0
+        for i in range(count):
+            fd = m.ready[i]
+            lent = m.of[fd] if fd < m.size else 0
+            if not lent or m.heed(record_at(lent), 0, 0, 0):
+                m.ready[left] = fd
+                left += 1
+        if left or not count:
+            return left

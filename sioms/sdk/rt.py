@@ -131,6 +131,9 @@ def become_realtime(priority: int, log: Callable[[str, str], None]) -> list[str]
         What was refused, in words, for the log.
     """
     refused = []
+    gc.collect()  # first: it may take longer than a real-time process may work without a pause
+    gc.freeze()
+    gc.disable()
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)
     if priority:
         try:
@@ -141,9 +144,6 @@ def become_realtime(priority: int, log: Callable[[str, str], None]) -> list[str]
     # ONFAULT: the pages shared with the fork server stay shared until they are written.
     if _libc.mlockall(_MCL_CURRENT | _MCL_FUTURE | _MCL_ONFAULT):
         refused.append(f"mlockall ({errno.errorcode.get(ctypes.get_errno(), '?')})")
-    gc.collect()
-    gc.freeze()
-    gc.disable()
     return refused
 
 
@@ -155,3 +155,12 @@ def become_user(user: str) -> None:
     os.initgroups(user, entry.pw_gid)
     os.setgid(entry.pw_gid)
     os.setuid(entry.pw_uid)
+
+
+def settle(priority: int, user: str, log: Callable[[str, str], None]) -> None:
+    """Become who the process shall be: its user, its scheduling class."""
+    if user and os.getuid() == 0:
+        become_user(user)
+    refused = become_realtime(priority, log)
+    if refused:
+        log("debug", "runs without " + ", ".join(refused))

@@ -13,8 +13,7 @@ import mmap
 import os
 import select
 import time
-import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
@@ -36,15 +35,15 @@ from .alarm_watch import AlarmWatch
 from .attachments import SHARES, Attachments
 from .blocks import AnyBlock, AxisBlock
 from .control import Control
-from .driver import Driver, LineDriver, StreamDriver, TickDriver
+from .driver import Driver
 from .effects import Effects
-from .engine import Engine
+from .engines import make_engine
 from .exchange import HookError
+from .failing import fail
 from .handles import LOOKS_A_MS, Handle, Waits
 from .held import Held
 from .idling import Idling
 from .inputs import Input
-from .line_engine import LineEngine
 from .markers import Markers
 from .outputs import Outputs
 from .pages import Pages
@@ -52,10 +51,9 @@ from .parts import Parts, Service
 from .persistence import keep_positions
 from .quiet import QuietRun, quiet_run
 from .quiet_step import RESTED, STIRS, Quiet
-from .rt import ChangeWatch, TimerFd, become_realtime, become_user, name_process
+from .rt import ChangeWatch, TimerFd, settle
 from .statistics import Reports, TickStatistics
 from .stops import Reason, Stop, Stops
-from .stream_engine import StreamEngine
 from .tick_engine import TickEngine
 
 STOP_GRACE_NS = 2_000_000_000
@@ -68,34 +66,8 @@ SURE = 4
 """One tick in so many leaves time for clients' work however long it took."""
 
 
-def run(
-    driver: type[Driver],
-    device: str,
-    settings: Any,
-    generation: int,
-    options: Mapping[str, Any],
-    fds: Sequence[int],
-) -> int:
-    """Be the driver process of a device; returns the exit status when the daemon says so or is gone.
-
-    Args:
-        driver: the driver's class.
-        device: device name.
-        settings: its validated settings.
-        generation: number of this process among the device's.
-        options: stop_sources, alarms, daemon_lease_s, lease_s, realtime_priority, user, phase of the tick [period],
-            state_folder, stopped: what of the device is stopped, see ``Stops.restore``.
-        fds: control socket, latch page, stop-request file, file of the requests taken, marker table, journal of stops,
-            journal.
-    """
-    name_process(f"sioms:{device}")
-    runtime = Runtime(driver, device, settings, generation, options, fds)
-    wanted = options["realtime_priority"]
-    return runtime.run(driver.realtime_priority if wanted is None else int(wanted), str(options["user"]))
-
-
 class Runtime:
-    """A driver process; the driver sees it as its ``Kit``.
+    """A driver process, or its part for one device; the driver sees it as its ``Kit``.
 
     Concurrency: one thread.
     """
@@ -153,7 +125,7 @@ class Runtime:
         self.alarms = AlarmWatch(self.blocks, options["alarms"], self.tell, self.stops.stop_by_alarm)
         self.pages.watch = self.alarms.look if options["alarms"] else None
         parts = Parts(self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log)
-        self.engine = self.stops.engine = self._make_engine(parts)
+        self.engine = self.stops.engine = make_engine(parts, self.driver, self._description.tick_hz)
         service = Service(
             self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log,
             self.driver, self.engine, Reports(self.statistics, self.engine, self.driver, handles),
@@ -166,7 +138,7 @@ class Runtime:
         self._is_used = False
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._announced = self._slack_ns = self._spare_until_ns = 0
-        self._expired, self._sees_requests = 0, False
+        self._expired, self.sees_requests = 0, False
         self._quiet: QuietRun | None = None
 
     # --- services to the driver (Kit) ------------------------------------------------------------
@@ -235,20 +207,14 @@ class Runtime:
     def run(self, priority: int, user: str) -> int:
         """Tick until told to end; return the exit status."""
         self._watch_requests()  # before that user may not look at it any more
-        if user and os.getuid() == 0:
-            become_user(user)
-        refused = become_realtime(priority, self.log)
-        if refused:
-            self.log("debug", "runs without " + ", ".join(refused))
-        self.turns.gives_way = os.sched_getscheduler(0) == os.SCHED_FIFO
-        status = 0
+        settle(priority, user, self.log)
         try:
             self.start()
             self._loop()
         except Exception as error:  # any failure of a driver: stop first, report second
-            status = 1
-            self._fail(error)
-        return status
+            self.fail(error)
+            return 1
+        return 0
 
     def start(self) -> None:
         """Be stopped as the process before this one was, tick for the first time, and tell the daemon."""
@@ -258,6 +224,7 @@ class Runtime:
         phase_ns = int(self._phase * self.period_ns)
         self._scheduled_ns = time.monotonic_ns() // self.period_ns * self.period_ns + phase_ns
         self._timer.set(self._scheduled_ns + 2 * self.period_ns - self._lead_ns, self.period_ns)
+        self.turns.gives_way = os.sched_getscheduler(0) == os.SCHED_FIFO
         self.looked_ns = time.monotonic_ns()
         self.stops.restore(self._stopped)
         self.stops.look()
@@ -268,7 +235,7 @@ class Runtime:
 
     def _make_quiet(self) -> QuietRun | None:
         """Return what ticks by compiled steps; None where a tick has to look at more than they do."""
-        if self._stops_workcell or self.pages.watch or not self._sees_requests:
+        if self._stops_workcell or self.pages.watch or not self.sees_requests:
             return None
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._latch_words, self.period_ns,
@@ -286,43 +253,83 @@ class Runtime:
 
         def asked() -> None:
             watch.drain()
-            self._wake()
-            self.stops.heed()
+            self.heed_requests()
 
         self.watch(watch.fd, asked)
-        self._sees_requests = True
+        self.sees_requests = True
+
+    def heed_requests(self) -> None:
+        """Look at the stop-request file, which has changed."""
+        self._wake()
+        self.stops.heed()
 
     def _loop(self) -> None:
-        callbacks, turns = self._callbacks, self.turns
         while self.running:
-            for fd in self._wait():
-                callback = callbacks.get(fd)
-                if callback is not None:
-                    callback()
-                else:
-                    turns.mark(fd)
-            turns.serve()  # one request, after all that is due
-            if self._control.is_behind:
-                self._control_readable()
+            self.serve(self._wait())
+
+    def serve(self, ready: Iterable[int]) -> None:
+        """Do what descriptors that are ready ask for, and serve one request after all that."""
+        callbacks, turns = self._callbacks, self.turns
+        for fd in ready:
+            callback = callbacks.get(fd)
+            if callback is not None:
+                callback()
+            else:
+                turns.mark(fd)
+        turns.serve()
+        if self._control.is_behind:
+            self._control_readable()
+
+    @property
+    def pause_s(self) -> float | None:
+        """How long the process may wait at most before ``serve`` has to be called again [s]; None for ever."""
+        return 0.0 if self._control.is_behind else self.turns.pause_s
+
+    @property
+    def poll_fd(self) -> int:
+        """Descriptor that is readable when there is something to serve."""
+        return self._epoll.fileno()
+
+    def ready_but(self, known: Sequence[int]) -> list[int]:
+        """Return the descriptors that are ready, without those that are known to be."""
+        return [fd for fd, _ in self._epoll.poll(0) if fd not in known]
+
+    def release(self) -> None:
+        """Close what is open, when the process goes on with other devices; the daemon hears of it last."""
+        self.clients.end_all(errno.EIO, "its driver has ended")
+        for timer in (self._timer, self._line_timer):
+            timer.close()
+        self._epoll.close()
+        self._control.close()
 
     def _wait(self) -> list[int]:
         """Wait for events; return the descriptors that are ready."""
-        pause_s = 0.0 if self._control.is_behind else self.turns.pause_s
-        ready = None
+        quiet = self.lend()
+        if quiet is None:
+            return [fd for fd, _ in self._epoll.poll(self.pause_s)]
+        quiet.run()
+        return self.take_back(quiet)
+
+    def lend(self) -> QuietRun | None:
+        """Let steps tick while the process waits; return None when they may not, or there are none."""
         is_early = self._line_due_ns is not None and not self._announced
-        if self._quiet and pause_s is None and not (is_early or self._ending_ns or self._daemon_late):
-            watched = bool(self.clients.handles) or self._is_used
-            ready = self._quiet.wait(self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns)
-        if self._quiet is None or ready is None:
-            return [fd for fd, _ in self._epoll.poll(pause_s)]
-        self._resume(self._quiet.record)
+        if self._quiet is None or is_early or self._ending_ns or self._daemon_late or self.pause_s is not None:
+            return None
+        watched = bool(self.clients.handles) or self._is_used
+        lent = self._quiet.lend(self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns)
+        return self._quiet if lent else None
+
+    def take_back(self, quiet: QuietRun) -> list[int]:
+        """Go on after ``lend``; return the descriptors that are ready."""
+        ready = quiet.take_back()
+        self._resume(quiet.record)
         return ready
 
     def _resume(self, quiet: Quiet) -> None:
         """Go on behind ticks that have been done by steps."""
         self._expired = quiet.expired
         self._announced, self._slack_ns = quiet.announced, quiet.worked_ns
-        self._line_due_ns = quiet.scheduled_ns + self.period_ns if quiet.announced else None
+        self._line_due_ns = quiet.scheduled_ns + quiet.announced * self.period_ns if quiet.announced else None
         if not quiet.done:
             return
         self.tick, self.looked_ns = quiet.number, quiet.began_ns
@@ -476,24 +483,10 @@ class Runtime:
         else:
             self.engine.line_due()
 
-    def _fail(self, error: Exception) -> None:
+    def fail(self, error: Exception) -> None:
         """Stop first, report second: the driver has raised what it should not have."""
-        what = ""
-        if isinstance(error, HookError) and isinstance(error.__cause__, Exception):
-            what, error = f" in {error}", error.__cause__
-        trace = "".join(traceback.format_exception(error)[-3:])
         until_ns = time.monotonic_ns() + FAIL_GRACE_NS
-        attempts: list[Callable[[], None]] = [
-            lambda: self.stops.safe_stop(Reason(Stop.FAILURE, f"the driver failed: {error!r}", errno.EIO)),
-            self.engine.close,
-            lambda: self._run_line(until_ns),
-        ]
-        for attempt in attempts:
-            try:
-                attempt()
-            except Exception as second:  # nothing may keep the others from being stopped, nor this from being told
-                trace += f" (and while stopping: {second!r})"
-        self.log("error", f"driver failed{what}: {error!r}: {trace}")
+        fail(error, self.stops, self.engine, lambda: self._run_line(until_ns), self.log)
 
     def _run_line(self, until_ns: int) -> None:
         """Let the line send what is left to send; nothing else runs any more."""
@@ -533,15 +526,6 @@ class Runtime:
             self.running = False
 
     # --- pages and links -------------------------------------------------------------------------
-
-    def _make_engine(self, parts: Parts) -> Engine:
-        if isinstance(self.driver, TickDriver):
-            return TickEngine(parts, self.driver, self._description.tick_hz)
-        if isinstance(self.driver, LineDriver):
-            return LineEngine(parts, self.driver, self._description.tick_hz)
-        if isinstance(self.driver, StreamDriver):
-            return StreamEngine(parts, self.driver)
-        raise TypeError(f"{type(self.driver).__name__} is not a TickDriver, LineDriver or StreamDriver")
 
     def _miss_daemon(self) -> None:
         if self._daemon_late or self._ending_ns:

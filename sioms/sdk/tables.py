@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Collection, Mapping
-from typing import Any, TypeVar, get_args, get_type_hints
+from functools import cache
+from typing import Any, TypeVar, cast, get_args, get_type_hints
 
 import msgspec
 
@@ -47,15 +48,21 @@ def table_type(
 
 def from_table(kind: type[T], table: msgspec.Struct, given: Mapping[str, Any] | None = None) -> T:
     """Return the dataclass from what was read; ``given`` are the fields that the configuration does not give."""
-    hints = get_type_hints(kind)
     values = dict(given or {})
-    for field in dataclasses.fields(kind):  # type: ignore[arg-type]  # kind is a dataclass by contract
-        if field.name in values or not hasattr(table, field.name):
+    for name, inner in _dataclass_fields(cast("type", kind)):
+        if name in values or not hasattr(table, name):
             continue
-        value = getattr(table, field.name)
-        inner = next((k for k in (hints[field.name], *get_args(hints[field.name])) if _is_dataclass(k)), None)
-        values[field.name] = from_table(inner, value) if isinstance(value, msgspec.Struct) and inner else value
+        value = getattr(table, name)
+        values[name] = from_table(inner, value) if isinstance(value, msgspec.Struct) and inner else value
     return kind(**values)
+
+
+@cache
+def _dataclass_fields(kind: type) -> list[tuple[str, type | None]]:
+    """Return the fields of a dataclass, each with the dataclass that it may be."""
+    hints = get_type_hints(kind)
+    found = [(field.name, (hints[field.name], *get_args(hints[field.name]))) for field in dataclasses.fields(kind)]
+    return [(name, next((each for each in kinds if _is_dataclass(each)), None)) for name, kinds in found]
 
 
 def _is_dataclass(hint: object) -> bool:

@@ -1,0 +1,228 @@
+"""A driver process of several light devices: one wait for all, and a runtime each.
+
+What one device raises ends that device, as in a process of its own. What a driver does to the process (a crash, a loop
+without end, SIGKILL) it does to all in it; so devices share a process only where the configuration says so.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+import select
+import socket
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import dataclass
+
+import numpy as np
+
+from sioms.descriptors import receive
+from sioms.native.language import library
+from sioms.native.system import MOST_EVENTS
+from sioms.protocol.driver_verbs import TO_FORK_SERVER, Spawn
+from sioms.protocol.messages import MAX_UNPACKED
+from sioms.protocol.verbs import take
+
+from .finding import find_driver, read_settings
+from .quiet import QuietRun
+from .quiet_step import Many, heed_one, run_many
+from .rt import ChangeWatch, name_process, settle
+from .runtime import Runtime
+
+MOST_FILES = 65536
+"""Descriptors that the process may have: a device takes some thirty."""
+REQUEST = 2
+"""Which of a device's descriptors is the stop-request file, see ``process.run``."""
+PAUSE_S = 50e-6
+"""After each device that has come: a process in a real-time class must not work for long without a pause."""
+
+
+@dataclass(slots=True)
+class Member:
+    """A device of the process.
+
+    Attributes:
+        runtime: its own.
+        fds: what its runtime has been given and does not close itself.
+        priority, user: of the process, by what its configuration says.
+        quiet: by whom it ticks while it waits; None: by its loop.
+    """
+
+    runtime: Runtime
+    fds: list[int]
+    priority: int
+    user: str
+    quiet: QuietRun | None = None
+
+
+class Group:
+    """The devices of this process, and the socket on which more of them come.
+
+    Args:
+        sock: to the fork server; its end is the end of the process when there is no device left.
+
+    Concurrency: the one thread of the process.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        self._sock: socket.socket | None = sock
+        self._epoll = select.epoll()
+        self._epoll.register(sock.fileno(), select.EPOLLIN)
+        self._members: dict[int, Member] = {}
+        self._built: deque[Member] = deque()
+        self._requests: ChangeWatch | None = None
+        self._is_settled = False
+        self._of = np.zeros(MOST_FILES, dtype=np.int64)
+        self._ready = np.zeros(MOST_EVENTS, dtype=np.int64)
+        self._many = Many(
+            poll=self._epoll.fileno(), ready=self._ready, timeout_ms=-1, of=self._of, size=MOST_FILES, heed=heed_one
+        )
+
+    def run(self) -> None:
+        """Serve devices until there is none and none can come."""
+        while self._members or self._built or self._sock is not None:
+            if self._built:
+                self._start(self._built.popleft())
+            for fd in self._wait():
+                member = self._members.get(fd)
+                if member is not None:
+                    self._serve(fd, member)
+                elif self._requests is not None and fd == self._requests.fd:
+                    self._heed_requests()
+                elif self._sock is not None and fd == self._sock.fileno():
+                    self._take(self._sock)
+
+    def _wait(self) -> list[int]:
+        """Return the descriptors that are ready; those of members who have more to do are."""
+        pauses = {fd: pause for fd, m in self._members.items() if (pause := m.runtime.pause_s) is not None}
+        timeout_s = 0.0 if self._built else min(pauses.values(), default=None)
+        if library is None:
+            found = [fd for fd, _ in self._epoll.poll(timeout_s)]
+        else:
+            self._many.timeout_ms = -1 if timeout_s is None else math.ceil(timeout_s * 1e3)
+            found = self._ready[: run_many(self._many)].tolist()
+        return found + [fd for fd in pauses if fd not in found]
+
+    # --- devices ---------------------------------------------------------------------------------
+
+    def _take(self, sock: socket.socket) -> None:
+        """Take a device that the fork server sends; all that come first, for none ticks then."""
+        first = True
+        while first or (not self._members and select.select([sock], [], [], 0)[0]):
+            first = False
+            try:
+                packet, fds = receive(sock, 1 << 20, 8)
+            except OSError:
+                packet, fds = b"", []
+            if not packet:
+                self._epoll.unregister(sock.fileno())
+                sock.close()
+                self._sock = None
+                break
+            try:
+                message = take(packet, TO_FORK_SERVER, values=MAX_UNPACKED)[1]
+                if isinstance(message, Spawn):
+                    self._built.append(self._build(message, fds))
+            except Exception:  # the daemon hears of it by the end of the control socket
+                traceback.print_exc()
+                _close(fds)
+                break
+
+    def _build(self, message: Spawn, fds: list[int]) -> Member:
+        device, name, table, generation, options = message
+        driver = find_driver(name, options["folder"])
+        settings, errors = read_settings(driver, table, options["folder"])
+        if errors:
+            raise ValueError("; ".join(errors))
+        runtime = Runtime(driver, device, settings, generation, options, fds)
+        wanted = options["realtime_priority"]
+        priority = driver.realtime_priority if wanted is None else int(wanted)
+        return Member(runtime, fds[1:], priority, str(options["user"]))
+
+    def _start(self, member: Member) -> None:
+        runtime = member.runtime
+        self._settle(member)
+        runtime.sees_requests = self._requests is not None
+        self._members[runtime.poll_fd] = member
+        self._epoll.register(runtime.poll_fd, select.EPOLLIN)
+        self._guarded(member, runtime.start)
+        self._go_on(runtime.poll_fd, member)
+        time.sleep(PAUSE_S)
+
+    def _settle(self, member: Member) -> None:
+        """Become who the process shall be, with the first of its devices."""
+        if self._is_settled:
+            return
+        self._is_settled = True
+        log = member.runtime.log
+        try:
+            self._requests = ChangeWatch(member.fds[REQUEST - 1])
+            self._epoll.register(self._requests.fd, select.EPOLLIN)
+        except OSError as error:
+            log("debug", f"stops through the stop-request file are seen in ticks: {error.strerror}")
+        settle(member.priority, member.user, log)
+
+    def _serve(self, fd: int, member: Member) -> None:
+        ready = self._take_back(fd, member)
+        self._guarded(member, lambda: member.runtime.serve(ready + member.runtime.ready_but(ready)))
+        self._go_on(fd, member)
+
+    def _take_back(self, fd: int, member: Member) -> list[int]:
+        """Have the loop of a device go on; return the descriptors that are ready."""
+        quiet, member.quiet = member.quiet, None
+        self._of[fd] = 0
+        return [] if quiet is None else member.runtime.take_back(quiet)
+
+    def _go_on(self, fd: int, member: Member) -> None:
+        """Let a device tick by steps, or leave."""
+        if not member.runtime.running:
+            del self._members[fd]
+            self._epoll.unregister(fd)
+            member.runtime.release()
+            _close(member.fds)
+            return
+        member.quiet = member.runtime.lend()
+        if member.quiet is not None:
+            self._of[fd] = member.quiet.record.address
+
+    def _guarded(self, member: Member, work: Callable[[], object]) -> None:
+        """Do the work of one device; what it raises ends this one."""
+        try:
+            work()
+        except Exception as error:  # stop first, report second; the others go on
+            member.runtime.fail(error)
+            member.runtime.running = False
+
+    def _heed_requests(self) -> None:
+        """Somebody asks for a stop: all devices brake, then whatever else there is to do."""
+        if self._requests is not None:
+            self._requests.drain()
+        for fd, member in list(self._members.items()):
+            ready = self._take_back(fd, member)
+            self._guarded(member, member.runtime.heed_requests)
+            if ready:
+                self._guarded(member, lambda ready=ready, member=member: member.runtime.serve(ready))  # type: ignore[misc]
+            self._go_on(fd, member)
+
+
+def _close(fds: list[int]) -> None:
+    for fd in fds:
+        with suppress(OSError):
+            os.close(fd)
+
+
+def main(name: str, sock: socket.socket) -> None:
+    """Be the driver process of several devices until there is none left.
+
+    Args:
+        name: of the process.
+        sock: to the fork server, on which devices come.
+    """
+    name_process(f"sioms:{name}")
+    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, MOST_FILES), most))
+    Group(sock).run()
