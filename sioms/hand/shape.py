@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -137,6 +137,11 @@ def _row(angles: Array, derivative: int = 0) -> Array:
 
 SIDE_M, CORNER_M = 0.2, 4e-3
 """Radii of curvature from which on a touch is one of a straight side, and up to which it is one of a corner [m]."""
+ROUND_M = 8e-3
+"""Radius up to which a touch may be one of a corner that is felt together with a side [m]."""
+_APART = math.radians(5.0)  # of the normals of two touches of one corner
+_AGREE_M = 0.2e-3
+_USUAL_M = 1.5e-3  # radius of a corner that nobody has touched
 _ASIDE = 0.3
 _PARALLEL = math.radians(1.0)
 
@@ -148,6 +153,7 @@ def expected(touches: Sequence[Touch], held: Grasp) -> list[Parallel]:
         touches: all since the object has moved last, those of the present grasp at the end.
         held: the present grasp.
     """
+    touches = with_corners(touches)
     if (between := _between_sides(touches, held.direction)) is not None:
         return [between]
     new = touches[-2:]
@@ -155,9 +161,32 @@ def expected(touches: Sequence[Touch], held: Grasp) -> list[Parallel]:
     if all(sides):
         return across_sides(touches, held.direction) or [_thicker(held)]
     if any(sides) or any(touch.radius_m < CORNER_M for touch in new):
-        x, y, psi, d, _, _ = regrasp_convex(held, (1.0 / new[0].radius_m, 1.0 / new[1].radius_m))
+        bends = [0.0 if side else 1.0 / touch.radius_m for side, touch in zip(sides, new, strict=True)]
+        x, y, psi, d, _, _ = regrasp_convex(held, (bends[0], bends[1]))
         return [Parallel(x, y, psi, d - 2.0 * FINGER_M, math.inf)]
     return Shape(touches).parallels(held.direction)
+
+
+def with_corners(touches: Sequence[Touch]) -> list[Touch]:
+    """Return the touches, of those on one corner the radius that makes them agree: p - r n is its centre for both.
+
+    A touch near the end of a side feels a corner rounder than it is; two places and normals tell its radius better.
+    """
+    found = list(touches)
+    for i, one in enumerate(found):
+        for j, other in enumerate(found[:i]):
+            dx, dy = one.point[0] - other.point[0], one.point[1] - other.point[1]
+            ex, ey = math.cos(one.normal) - math.cos(other.normal), math.sin(one.normal) - math.sin(other.normal)
+            square = ex * ex + ey * ey
+            if max(one.radius_m, other.radius_m) > ROUND_M or square < _APART**2:
+                continue
+            radius = (dx * ex + dy * ey) / square
+            if not 0.0 <= radius <= CORNER_M or math.hypot(dx - radius * ex, dy - radius * ey) > _AGREE_M:
+                continue
+            deviation = PLACE_M / math.sqrt(square)
+            found[i] = replace(one, radius_m=max(radius, 1e-5), radius_deviation_m=deviation)
+            found[j] = replace(other, radius_m=max(radius, 1e-5), radius_deviation_m=deviation)
+    return found
 
 
 def _between_sides(touches: Sequence[Touch], direction: float) -> Parallel | None:
@@ -190,9 +219,11 @@ def across_sides(touches: Sequence[Touch], direction: float) -> list[Parallel]:
     """Return the grasps across straight sides that have been touched, from the corner that lies opposite, or the
     parallel side, by the angle to a direction [rad].
 
-    The sides bound the object; corners in which two of them meet are taken for its own.
+    The sides bound the object; corners in which two of them meet are taken for its own, rounded as the sharpest that
+    has been touched: all sides are moved in by that radius, so that they meet in the corners' centres.
     """
-    sides = [touch for touch in touches if touch.radius_m > SIDE_M]
+    rounded = min((touch.radius_m for touch in touches if touch.radius_m < CORNER_M), default=_USUAL_M)
+    sides = [_inset(touch, rounded) for touch in touches if touch.radius_m > SIDE_M]
     points = np.array([touch.point for touch in touches])
     middle = points.mean(axis=0)
     reach = 4.0 * float(np.hypot(*(points - middle).T).max())
@@ -216,11 +247,15 @@ def across_sides(touches: Sequence[Touch], direction: float) -> list[Parallel]:
         at = float(t @ corners[far])
         if not ends[0] < at < ends[1]:
             continue
-        foot = corners[far] + depth[far] * n
-        x, y = 0.5 * (foot + corners[far])
+        x, y = corners[far] + 0.5 * depth[far] * n
         psi = side.normal if math.cos(side.normal - direction) > 0.0 else side.normal + math.pi
-        found.append(Parallel(float(x), float(y), psi, depth[far], 0.0))
+        found.append(Parallel(float(x), float(y), psi, depth[far] + 2.0 * rounded, 0.0))
     return sorted(found, key=lambda one: abs(math.remainder(one.direction - direction, math.tau)))
+
+
+def _inset(side: Touch, by_m: float) -> Touch:
+    x, y = side.point
+    return replace(side, point=(x - by_m * math.cos(side.normal), y - by_m * math.sin(side.normal)))
 
 
 def _clipped(corners: list[Array], owners: list[int], number: int, side: Touch) -> tuple[list[Array], list[int]]:

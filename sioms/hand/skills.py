@@ -248,6 +248,7 @@ class Skills:
         self.rolls += 1
         self._past.clear()  # the object moves
         manner, since, low, high = self.manner, self.now.time_s, *self.manner.arc
+        latest_s = since + manner.roll_s
         self.say(f"roll from {_degrees(self._seen())}")
         filtered: tuple[float, float] | None = None
         while self.now.time_s - since < 0.15:
@@ -259,6 +260,9 @@ class Skills:
                 since = self.now.time_s
             if not all(low < finger.phi < high for finger in self.now.fingers if finger.touched):
                 self.say("the array ends", Fault.ARRAY_END)
+                break
+            if self.now.time_s > latest_s:
+                self.say(f"not parallel after {manner.roll_s:g} s of rolling: {_degrees(seen)}", Fault.NOT_PARALLEL)
                 break
             if self.now.time_s - last_s <= 0.0:
                 raise Failed(Fault.STALE, "roll object: readings do not go on in time")

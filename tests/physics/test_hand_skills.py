@@ -49,6 +49,20 @@ def test_a_disk_is_rolled_until_it_is_held_parallel() -> None:
     assert [1 / bend for bend in last.curvatures] == pytest.approx([20 * MM, 20 * MM], rel=0.1)
 
 
+def test_rolling_that_leads_nowhere_ends() -> None:
+    class Nowhere(Skills):
+        def _law(self, eta: tuple[float, float]) -> tuple[float, float]:
+            return 0.0, 0.0
+
+    hand = PlaneHand(Body(disk(20 * MM)), (0.0, 2 * MM, 0.0), RIG, seed=1)
+    skills = Nowhere(hand.hand, hand.reading, Manner(roll_s=0.4))
+    hand.run(skills.grasp())
+    began_s = hand.world.time_s
+    hand.run(skills.roll())
+    assert hand.world.time_s - began_s < 1.0
+    assert skills.events[-1].fault is Fault.NOT_PARALLEL and "after 0.4 s" in skills.events[-1].text
+
+
 def test_the_same_grasp_comes_out_the_same() -> None:
     ends = []
     for _ in range(2):

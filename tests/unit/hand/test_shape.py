@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sioms.hand.contacts import Grasp, grasp_of
-from sioms.hand.shape import Shape, Touch, across_sides, expected
+from sioms.hand.shape import Shape, Touch, across_sides, expected, with_corners
 
 A, B = 0.035, 0.022
 FINGER = 12.7e-3
@@ -72,10 +72,11 @@ def sides(points: np.ndarray, shares: list[float]) -> list[Touch]:
 
 def test_a_triangle_is_held_across_a_height() -> None:
     points = np.array([[0.0, 0.0], [0.05, 0.0], [0.02, 0.04]])
-    found = across_sides(sides(points, [0.3, 0.5, 0.6]), math.radians(-90.0))[0]
+    sharp = Touch((0.05, 0.0), 0.0, 1e-6, 1e-6)
+    found = across_sides([*sides(points, [0.3, 0.5, 0.6]), sharp], math.radians(-90.0))[0]
     assert math.remainder(found.direction + 0.5 * math.pi, math.pi) == pytest.approx(0.0, abs=1e-9)
-    assert (found.x, found.y) == pytest.approx((0.02, 0.02))
-    assert found.apart_m == pytest.approx(0.04)
+    assert (found.x, found.y) == pytest.approx((0.02, 0.02), abs=1e-5)
+    assert found.apart_m == pytest.approx(0.04, abs=1e-5)
 
 
 def test_a_corner_that_nobody_has_touched_is_not_relied_on() -> None:
@@ -104,3 +105,41 @@ def test_two_sides_that_form_a_wedge_are_touched_next_towards_its_thick_end() ->
     left, right = Touch((0.0, 0.0), math.pi, 10.0, 1.0), Touch((0.03, 0.0), -tilt, 10.0, 1.0)
     found = expected([left, right], held(left, right))[0]
     assert found.y > 0.005
+
+
+def on_corner(centre: tuple[float, float], radius: float, normal: float, felt: float) -> Touch:
+    """Touch a rounded corner, that is felt with another radius than it has."""
+    point = centre[0] + radius * math.cos(normal), centre[1] + radius * math.sin(normal)
+    return Touch(point, normal, felt, 1e-3)
+
+
+def test_two_touches_of_a_corner_tell_its_radius() -> None:
+    centre, radius = (0.03, 0.004), 2.5e-3
+    touches = [on_corner(centre, radius, math.radians(at), felt) for at, felt in ((10.0, 0.8e-3), (50.0, 6e-3))]
+    assert [touch.radius_m for touch in with_corners(touches)] == pytest.approx([radius, radius])
+    side = Touch((0.0, 0.0), math.pi, 10.0, 1.0)
+    apart = Touch((-0.02, 0.02), math.radians(100.0), 2e-3, 1e-3)  # another corner
+    assert with_corners([side, apart, touches[0]]) == [side, apart, touches[0]]
+
+
+def test_a_side_and_a_corner_that_has_been_touched_twice() -> None:
+    centre, radius = (0.03, 0.004), 3e-3
+    side = Touch((0.0, 0.01), math.pi, 0.9, 0.5)  # no side is felt quite straight
+    first, second = (on_corner(centre, radius, math.radians(at), 1e-3) for at in (70.0, 20.0))
+    found = expected([side, first, side, second], held(side, second))[0]
+    assert found.direction == pytest.approx(0.0, abs=1e-4)
+    assert (found.x, found.y) == pytest.approx((0.0165, 0.004), abs=1e-5) and found.apart_m == pytest.approx(
+        0.033, abs=1e-5
+    )
+
+
+def test_sides_meet_in_the_middle_of_a_rounded_corner() -> None:
+    sharp = np.array([[0.0, 0.0], [0.06, 0.0], [0.01, 0.04]])
+    rounded = 2e-3
+    corner = Touch((0.06, 0.0), 0.0, rounded, 1e-4)  # its radius counts, not its place
+    found = across_sides([*sides(sharp, [0.3, 0.5, 0.6]), corner], math.radians(-90.0))[0]
+    n1, n2 = (np.array([0.04, 0.05]) / math.hypot(0.04, 0.05), np.array([-0.04, 0.01]) / math.hypot(0.04, 0.01))
+    # where the sides that meet opposite the first, each moved in by the radius, cross
+    centre = np.linalg.solve(np.array([n1, n2]), np.array([n1 @ sharp[2], n2 @ sharp[2]]) - rounded)
+    assert found.x == pytest.approx(centre[0], abs=1e-6)
+    assert found.apart_m == pytest.approx(centre[1] + rounded, abs=1e-6)
