@@ -134,7 +134,8 @@ class Snapshot:
     def __len__(self) -> int:
         return self._layout.count
 
-    def __getitem__(self, channel: int | str) -> Any:
+    def _index(self, channel: int | str) -> int:
+        """Return the index of a channel; raises KeyError or IndexError for what is none."""
         count = self._layout.count
         if isinstance(channel, str):
             if channel not in self._layout.names:
@@ -142,10 +143,14 @@ class Snapshot:
             channel = self._layout.names.index(channel)
         if not -count <= channel < count:
             raise IndexError(f"channel {channel} of a node of {count}; want {-count} to {count - 1}")
+        return channel
+
+    def __getitem__(self, channel: int | str) -> Any:
+        index = self._index(channel)
         # Loaded when first used: named tuples are a tenth of the start time of a shell tool.
         from .reading import READING
 
-        return READING[self._layout.node_class](*[self._row(name)[channel] for name in self._layout.columns])
+        return READING[self._layout.node_class](*[self._row(name)[index] for name in self._layout.columns])
 
     def __iter__(self) -> Iterator[Any]:
         return iter([self[i] for i in range(len(self))])
@@ -214,17 +219,18 @@ class AnalogSnapshot(Snapshot):
         Raises:
             OSError: EIO, it is no measurement: flagged INVALID or SATURATED, or not finite.
         """
-        reading = self[channel]
-        if reading.flags & _UNFIT or reading.data - reading.data != 0.0:
+        index = self._index(channel)
+        value, flags = float(self.data[index]), int(self.flags[index])
+        if flags & _UNFIT or value - value != 0.0:
             names = self._layout.names
-            name = channel if isinstance(channel, str) else names[channel] if names else f"channel {channel}"
-            words = [flag.name.lower() for flag in AnalogStatus if flag & reading.flags and flag.name]
+            name = names[index] if names else f"channel {index}"
+            words = [flag.name.lower() for flag in AnalogStatus if flag & flags and flag.name]
             raise OSError(
                 EIO,
-                f"read {name}: {reading.data:g}, {' and '.join(words) or 'flagged good'}; want a finite value that is "
+                f"read {name}: {value:g}, {' and '.join(words) or 'flagged good'}; want a finite value that is "
                 "neither invalid nor saturated",
             )
-        return float(reading.data)
+        return value
 
 
 class BinarySnapshot(Snapshot):
