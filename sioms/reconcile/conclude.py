@@ -34,7 +34,7 @@ from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
-from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MOSTLY, QUIET, UNEXPLAINED
+from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MOSTLY, QUIET, REFUTED, UNEXPLAINED
 from sioms.reconcile.timed import as_recorded
 from sioms.reconcile.verdict import Gap, Outcome, Place
 
@@ -87,8 +87,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
     missing = bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd or bool(judged.refusals)
     said = outcome(bool(named), missing, bool(open_rivals))
-    if said is Outcome.UNEXPLAINED:
-        gaps = tuple(_beside_what_is_missing(g) for g in gaps)
+    gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)
     notes = [*ready.notes, *judged.notes, *judged.refusals]
     notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
     if ready.held and any(e.name in TIMES for e in named):
@@ -139,13 +138,15 @@ def _gaps(s: Searched, states: Sequence[State], rng: np.random.Generator) -> tup
         before = measure(plain, nominal, nominal, floor)
         gaps = tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
     free = freely((plain, ready.final), (nominal, model), noise, rng)
-    judged = judge(ready.final, model, free, gaps)
+    judged = judge(ready.final, model, free, gaps, noise.size)
     return (*gaps, *free_gaps(free, nominal.position_unit)), judged
 
 
-def _beside_what_is_missing(gap: Gap) -> Gap:
-    """Take no floor for known that holds what is missing: one from what a model left, or above what it leaves here."""
-    return replace(gap, floor=np.nan) if gap.floor_from == ON_MODEL or gap.after <= gap.floor else gap
+def _told(gap: Gap, missing: bool) -> Gap:
+    """Take no floor for known that is refuted by what is left, or that holds what is missing."""
+    read_off = gap.floor_from == ON_MODEL
+    refuted = gap.after < REFUTED * gap.floor if read_off and not missing else missing and gap.after <= gap.floor
+    return replace(gap, floor=np.nan) if refuted or (read_off and missing) else gap
 
 
 def _last(problem: Problem, s: Searched, rng: np.random.Generator) -> tuple[Fit, ...]:

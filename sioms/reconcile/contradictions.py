@@ -28,8 +28,11 @@ BETTER = 0.2
 ENOUGH = 0.5
 
 
-def usable(session: Session, model: AxisModel) -> tuple[Session, list[str]]:
+def usable(session: Session, seen: Session, model: AxisModel) -> tuple[Session, list[str]]:
     """Check every record by itself, and leave out those that cannot be used where most can.
+
+    Args:
+        seen: the same records, of which only what may take part in a choice is there.
 
     Returns:
         The session of what can be used, and what is to be said of the rest.
@@ -39,11 +42,11 @@ def usable(session: Session, model: AxisModel) -> tuple[Session, list[str]]:
             what would be right.
     """
     for r in session.final:
-        check_one(r, model)
+        check_one(r, r, model)
     kept, refused = [], []
-    for r in session.records:
+    for r, part in zip(session.records, seen.records, strict=True):
         try:
-            check_one(r, model)
+            check_one(r, part, model)
             kept.append(r)
         except BadInputError as e:
             refused.append(e)
@@ -55,14 +58,18 @@ def usable(session: Session, model: AxisModel) -> tuple[Session, list[str]]:
     return replace(session, records=tuple(kept), continuous=False), notes
 
 
-def check_one(r: Record, model: AxisModel) -> None:
+def check_one(record: Record, r: Record, model: AxisModel) -> None:
     """Check a record by itself.
+
+    Args:
+        record: as a whole, for its form.
+        r: what may be looked at of it.
 
     Raises:
         BadInputError: it cannot be used.
     """
-    check_record(r, model)
-    where = f"read record {r.name}"
+    check_record(record, model)
+    where = f"read record {record.name}"
     _check_rows(r, where)
     _check_smooth(r, model, where)
     _check_jumps(r, model, where)

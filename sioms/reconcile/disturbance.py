@@ -43,6 +43,11 @@ class Disturbance:
     frequencies: Array
     density: Array
 
+    @property
+    def size(self) -> float:
+        """Root mean square, [{F}]."""
+        return float(np.sqrt(np.trapezoid(self.density, self.frequencies)))
+
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
         """Draw a force, shape (count,), [{F}]."""
         size = 1 << int(np.ceil(np.log2(max(2 * count, 16))))

@@ -35,42 +35,70 @@ class Judgement:
     notes: tuple[str, ...]
 
 
-def judge(problem: Problem, model: AxisModel, free: Sequence[Freely], gaps: Sequence[Gap]) -> Judgement:
+def judge(problem: Problem, model: AxisModel, free: Sequence[Freely], gaps: Sequence[Gap], push: float) -> Judgement:
     """Judge a model.
 
     Args:
         problem: the samples that took no part.
+        push: the force that is taken for noise, root mean square, [{F}].
         free: how it runs free over them.
         gaps: of the closed loop, where it can be simulated: then that is the free run that counts.
     """
     loop = next((g for g in gaps if g.channel == FORCE_LOOP), None)
-    refusals = [*_impossible(problem, model, free)]
+    force = problem.join([r.force for r in problem.session.records])
+    refusals = _impossible(problem, model, free)
     if loop is not None:
-        force = problem.join([r.force for r in problem.session.records])
-        size = float(np.sqrt(np.mean((force - force.mean()) ** 2)))
-        above = [("in closed loop", loop.after, loop.floor, size)]
+        above = [Above("in closed loop", "force", loop.after, loop.floor, float(np.std(force)))]
     else:
-        above = [(f"running free {f.over}", f.after, f.floor, f.moved) for f in free]
-        if above and min(after / max(moved, 1e-300) for _, after, _, moved in above) > FREE_SHARE:
-            where, after, _, moved = min(above, key=lambda a: a[1] / max(a[3], 1e-300))
-            refusals.append(
-                f"{where}, the corrected model is off by {100 * after / moved:.0f} % of the motion: short windows hide "
-                "what it lacks"
-            )
-    far = [a for a in above if a[1] > FREE_FLOORS * a[2] and a[1] > FREE_LEAST * a[3]]
+        above = [Above(f"running free {f.over}", "motion", f.after, f.floor, f.moved) for f in free]
+        # what is taken for noise may be what is missing
+        refusals += _nowhere_near(free, above, push > FREE_LEAST * float(np.sqrt(np.mean(force**2))))
+    far = [a for a in above if a.after > FREE_FLOORS * a.floor and a.after > FREE_LEAST * a.size]
     if far and not refusals:
-        where, after, floor, size = max(far, key=lambda a: a[1] / a[2])
-        refusals.append(
-            f"{where}, the corrected model stays {after / floor:.0f} times above what noise makes of it "
-            f"({100 * after / size:.0f} % of the {'force' if loop is not None else 'motion'})"
-        )
-    near = [a for a in above if a[1] > FREE_NEAR * a[2] and a not in far]
-    notes = [
-        f"{where}, the corrected model stays {after / floor:.1f} times above the floor ({100 * after / size:.2g} % of "
-        f"the {'force' if loop is not None else 'motion'})"
-        for where, after, floor, size in sorted(near, key=lambda a: -a[1] / a[2])[:1]
+        refusals.append(f"{_most(far)}: noise makes no such thing of it")
+    near = [a for a in above if a.after > FREE_NEAR * a.floor and a not in far]
+    return Judgement(tuple(refusals), (_most(near),) if near else ())
+
+
+@dataclass(frozen=True, slots=True)
+class Above:
+    """How far a free run is from the measurement: what is left, its floor, and the size of what was measured."""
+
+    where: str
+    what: str
+    after: float
+    floor: float
+    size: float
+
+    @property
+    def share(self) -> float:
+        """What is left, of what was measured."""
+        return self.after / max(self.size, 1e-300)
+
+
+def _most(above: Sequence[Above]) -> str:
+    a = max(above, key=lambda a: a.after / a.floor)
+    return (
+        f"{a.where}, the corrected model stays {a.after / a.floor:.2g} times above the floor ({100 * a.share:.2g} % of "
+        f"the {a.what})"
+    )
+
+
+def _nowhere_near(free: Sequence[Freely], above: Sequence[Above], noisy: bool) -> list[str]:
+    """Say that a model comes nowhere near the motion, unless so little moves that noise alone explains it.
+
+    Over whole records there is one draw of noise, whose slowest part is not known: there it takes more.
+    """
+    if not above or min(a.share for a in above) <= FREE_SHARE:
+        return []
+    off = [f for f in free if f.after > (FREE_NEAR if np.isfinite(f.horizon_s) else FREE_FLOORS) * f.floor]
+    if not (noisy or off):
+        return []
+    least = min(above, key=lambda a: a.share)
+    return [
+        f"{least.where}, the corrected model is off by {100 * least.share:.0f} % of the motion: short windows hide "
+        "what it lacks"
     ]
-    return Judgement(tuple(refusals), tuple(notes))
 
 
 def _impossible(problem: Problem, model: AxisModel, free: Sequence[Freely]) -> list[str]:

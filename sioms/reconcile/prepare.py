@@ -93,7 +93,7 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         BadInputError: the data cannot be used.
     """
     session, notes = on_grid(session, nominal.sample_time_s)
-    session, left_out = usable(session, nominal)
+    session, left_out = usable(session, searched(session), nominal)
     notes += left_out
     notes += check(session, nominal)
     if session.final:
@@ -106,7 +106,7 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     ready = replace(_channels(session, nominal, notes, o), held=not runs_the_loop(session, nominal))
     if (other := reread(ready, ready.model, (), o)) is not None:
         return other
-    check_law(session, nominal)
+    check_law(searched(session), nominal)
     return ready
 
 

@@ -71,6 +71,8 @@ def _opening(p: Page, v: Verdict) -> None:
     lines = [f"{v.outcome.value} - {headline(v)}"]
     if v.effects or v.alternatives:
         lines.append("; or ".join(" and ".join(v.title(n) or n for n in s) or "nothing" for s in sets))
+    if v.outcome is Outcome.UNEXPLAINED and v.notes:  # the last of them is why
+        lines.append(f"{v.notes[-1][0].upper()}{v.notes[-1][1:]}")
     if where := places(v, 2):
         lines.append(f"Of the disagreement goes {where}")
     lines.append(f"On data that took no part, {shrunk(v.speaking)}")

@@ -66,8 +66,8 @@ def summary(v: Verdict, out: str) -> list[str]:
 
 def shrunk(gap: Gap) -> str:
     """Say how far a gap shrank."""
-    ends = f"{gap.channel}: {number(gap.before)} before, {number(gap.after)} after"
-    return f"{ends}, floor {number(gap.floor)} {gap.unit}" if gap.known else f"{ends} {gap.unit}, floor unknown"
+    before, after = (f"{number(x)} {gap.unit} {when}" for x, when in ((gap.before, "before"), (gap.after, "after")))
+    return f"{gap.channel}: {before}, {after}, floor {f'{number(gap.floor)} {gap.unit}' if gap.known else 'unknown'}"
 
 
 def places(v: Verdict, most: int) -> str:

@@ -43,6 +43,11 @@ def rows(chosen: Callable[[int], np.ndarray]) -> Change:
     return lambda r: Record(r.name, **{name: a[chosen(len(r))] for name, a in r.arrays().items()})
 
 
+def both(session: Session, model: AxisModel) -> tuple[Session, list[str]]:
+    """Look at all of the records."""
+    return usable(session, session, model)
+
+
 def noise(r: Record) -> Record:
     rng = np.random.default_rng(len(r.name))
     return replace(r, **{n: np.std(a) * rng.standard_normal(len(r)) for n, a in r.arrays().items() if n != "index"})
@@ -67,7 +72,7 @@ def test_records_that_agree_with_themselves_pass() -> None:
 )
 def test_a_contradiction_is_refused_with_its_reason(change: Change, said: str) -> None:
     with pytest.raises(BadInputError, match=said):
-        usable(every(change), given()[1])
+        both(every(change), given()[1])
 
 
 @pytest.mark.parametrize(
@@ -106,19 +111,19 @@ def test_one_bad_record_is_left_out_and_two_of_three_are_too_many() -> None:
     session, model = given()
     doubled = rows(lambda n: np.repeat(np.arange(n), 2))
     good, bad = session.records[0], doubled(session.records[1].cut(0, len(session.records[0]) // 4))
-    kept, notes = usable(replace(session, records=(good, bad)), model)
+    kept, notes = both(replace(session, records=(good, bad)), model)
     assert [r.name for r in kept.records] == [good.name] and not kept.continuous
     assert "left out" in notes[0] and bad.name in notes[0] and "come twice" in notes[0]
     with pytest.raises(BadInputError, match="come twice"):
-        usable(replace(session, records=(good, doubled(good), doubled(good))), model)
+        both(replace(session, records=(good, doubled(good), doubled(good))), model)
     with pytest.raises(BadInputError, match="come twice"):  # a final record was chosen to be one
-        usable(replace(session, final=(bad,)), model)
+        both(replace(session, final=(bad,)), model)
 
 
 def test_a_force_that_takes_two_levels_is_no_saturation() -> None:
     _, model = given()
     open_loop = every(lambda r: replace(r, force=np.where(np.arange(len(r)) % 900 < 600, 1.0, 0.4), command=None))
-    usable(open_loop, replace(model, controller=None))
+    both(open_loop, replace(model, controller=None))
 
 
 def test_an_inertia_that_is_said_to_be_uncertain_may_be_any() -> None:

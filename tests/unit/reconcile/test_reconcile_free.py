@@ -58,7 +58,8 @@ def judged(problem: Problem, nominal: AxisModel, model: AxisModel, explained: fl
     rng = np.random.default_rng(1)
     noise = disturbance(problem, model, explained)
     gaps = measure(problem, nominal, model, closed_floor(problem, model, noise, rng))
-    return judge(problem, model, freely((problem, problem), (nominal, model), noise, rng), gaps)
+    free = freely((problem, problem), (nominal, model), noise, rng)
+    return judge(problem, model, free, gaps, noise.size)
 
 
 def test_a_hardening_spring_shows_in_the_free_run_alone() -> None:
@@ -102,7 +103,17 @@ def test_a_drawn_disturbance_has_its_spectrum() -> None:
     noise = Disturbance(DT, at, np.where(at < 50.0, 0.02, 0.0))
     drawn = noise.drawn(200_000, np.random.default_rng(1))
     assert np.std(drawn) == pytest.approx(1.0, rel=0.03)
+    assert noise.size == pytest.approx(1.0, rel=0.03)
     assert np.std(np.diff(drawn)) < 0.3
+
+
+def test_a_cruise_in_which_nothing_changes_is_not_refused() -> None:
+    """Beside a constant speed there is no motion that noise could be small against."""
+    turning = replace(AXIS, controller=None, viscous=2e-3)
+    force, start = np.full(COUNT, 0.02), np.array([0.0, 10.0, 0.0, 0.0, 0.02, 0.0, 0.0])
+    run = released(pack(turning), force, start, coloured(4e-4, 5))
+    problem = Problem(Session((Record("cruise", run.position, force),)), observer(AXIS, 1e-5, 1e-3))
+    assert judged(problem, turning, turning).refusals == ()
 
 
 def test_friction_above_the_force_that_moved_the_machine_is_refused() -> None:
