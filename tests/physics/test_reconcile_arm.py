@@ -98,4 +98,4 @@ def test_a_geared_arm_gives_its_weight_and_both_sides_of_its_friction(tmp_path: 
         Outcome.AMBIGUOUS,
     )  # less than half a turn: a spring comes near gravity
     assert all(set(names) <= {"gravity", "lugre", "spring"} for names in verdict.alternatives)
-    assert all(gap.after < 2.0 * gap.floor for gap in verdict.gaps)
+    assert all(gap.after < 2.0 * gap.floor for gap in verdict.gaps if gap.known and "free" not in gap.channel)
