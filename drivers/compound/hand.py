@@ -3,18 +3,73 @@
 A device made of devices, see drivers/compound/README.md. With a table ``squeeze`` d takes force commands: an internal
 force [N], positive squeezes. In free space d then yields as a virtual spring about where it was, in contact it follows
 the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. The node
-``force`` shows that force and how late all this is.
+``force`` shows that force and how late all this is. etc/hand.toml is a whole hand with fingers that feel.
 
     [device.hand]
     driver = "hand"
     axes = ["left.x", "left.y", "left.th", "right.x", "right.y", "right.th"]
-    [device.hand.squeeze]
-    fingers = ["touch1.shape", "touch2.shape"]
-    [[device.hand.axis]]
+    axis = [
+        { name = "x", velocity_max = 0.1, acceleration_max = 1.0 },
+        { name = "y", velocity_max = 0.1, acceleration_max = 1.0 },
+        { name = "psi", velocity_max = 0.2, acceleration_max = 2.0 },
+        { name = "d", velocity_max = 0.1, acceleration_max = 1.0 },
+        { name = "phi1", velocity_max = 0.5, acceleration_max = 5.0 },
+        { name = "phi2", velocity_max = 0.5, acceleration_max = 5.0 },
+    ]
+    [device.left]
+    driver = "sim-axes"
+    [[device.left.axis]]
     name = "x"
-    velocity_max = 0.2
-    acceleration_max = 2.0
-    ...
+    position_min = -0.6
+    position_max = 0.6
+    velocity_max = 0.5
+    acceleration_max = 5.0
+    force_max = 60.0
+    motor = { mass = 1.4, viscous = 50.0, start = -0.2 }
+    [[device.left.axis]]
+    name = "y"
+    position_min = -0.6
+    position_max = 0.6
+    velocity_max = 0.5
+    acceleration_max = 5.0
+    force_max = 60.0
+    motor = { mass = 1.4, viscous = 50.0, start = 0.14 }
+    [[device.left.axis]]
+    name = "th"
+    unit = "rad"
+    position_min = -6.0
+    position_max = 6.0
+    velocity_max = 3.0
+    acceleration_max = 30.0
+    force_max = 0.8
+    motor = { mass = 0.01, viscous = 0.05, start = -1.57 }
+    [device.right]
+    driver = "sim-axes"
+    [[device.right.axis]]
+    name = "x"
+    position_min = -0.6
+    position_max = 0.6
+    velocity_max = 0.5
+    acceleration_max = 5.0
+    force_max = 60.0
+    motor = { mass = 1.4, viscous = 50.0, start = 0.2 }
+    [[device.right.axis]]
+    name = "y"
+    position_min = -0.6
+    position_max = 0.6
+    velocity_max = 0.5
+    acceleration_max = 5.0
+    force_max = 60.0
+    motor = { mass = 1.4, viscous = 50.0, start = -0.14 }
+    [[device.right.axis]]
+    name = "th"
+    unit = "rad"
+    position_min = -6.0
+    position_max = 6.0
+    velocity_max = 3.0
+    acceleration_max = 30.0
+    force_max = 0.8
+    motor = { mass = 0.01, viscous = 0.05, start = 1.57 }
 
 Lengths in metres, angles in radians.
 """
@@ -30,7 +85,7 @@ import msgspec
 from sioms.hand.control import Controller, Gains
 from sioms.hand.felt import felt, internal_force, wrist_force
 from sioms.hand.kinematics import COORDINATES, LINK_M, UNITS, Hand
-from sioms.hand.statics import damped_limit
+from sioms.hand.statics import damped_limit, filtered_limit
 from sioms.motion.axis_step import FORCE
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
@@ -275,11 +330,13 @@ def _check(squeeze: SqueezeTable, settings: HandSettings) -> None:
             f"squeeze: stiffness {squeeze.stiffness:g}, damping {squeeze.damping:g}; want more than 0, and 0 or more"
         )
     _gains(squeeze, settings)
-    limit = damped_limit(squeeze.stiffness, squeeze.damping, 1.0 / settings.tick_hz)
-    if not squeeze.damper < limit:
+    sample_s = 1.0 / settings.tick_hz
+    limits = damped_limit(squeeze.stiffness, squeeze.damping, sample_s), filtered_limit(squeeze.filter_s, sample_s)
+    if not squeeze.damper < min(limits):
         raise ValueError(
             f"squeeze: damper {squeeze.damper:g} m/(s N) is unstable at {settings.tick_hz:g} Hz with a stiffness of "
-            f"{squeeze.stiffness:g} N/m and a damping of {squeeze.damping:g} N s/m; want below {limit:.3g}"
+            f"{squeeze.stiffness:g} N/m, a damping of {squeeze.damping:g} N s/m and filter_s {squeeze.filter_s:g}; "
+            f"want below {min(limits):.3g}"
         )
 
 

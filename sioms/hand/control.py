@@ -26,7 +26,7 @@ class Gains:
         position: K [1/s], of x, y, psi, phi1 and phi2.
         spring_rate: K_d [1/s].
         spring: K_s [N/m].
-        damper: K_v [m/(s N)]; `damper_limit` tells where the loop becomes unstable.
+        damper: K_v [m/(s N)]; `damped_limit` and `filtered_limit` tell where the loop becomes unstable.
         filter_s: time constant of the low-pass of the force and of what is wanted of it [s]; 0 for none. Without one
             the link rings on the rubber at 400 Hz long before the quasi-static limit.
         opening_max: largest |d'| [m/s].

@@ -63,6 +63,21 @@ def damped_limit(stiffness: float, damping: float, sample_s: float) -> float:
     return 2.0 / (stiffness * sample_s + 2.0 * damping)
 
 
+RINGING_KG = 0.06
+"""Least (filter_s + sample_s) / K_v: at less a link of Table 4.1 rings on the rubber. Measured on the plane with 20 and
+50 ms at 400 Hz and with none at 20 Hz (`sioms bench hand`, row 5): it began at 0.037 to 0.056."""
+
+
+def filtered_limit(filter_s: float, sample_s: float) -> float:
+    """Return the largest gain K_v [m/(s N)] at which links do not ring on the rubber, for a low-pass of the force.
+
+    Args:
+        filter_s: time constant of the low-pass [s], 0 for none.
+        sample_s: T.
+    """
+    return (filter_s + sample_s) / RINGING_KG
+
+
 def damper_factor(gain: float, stiffness: float, sample_s: float, late: int = 0) -> float:
     """Return the largest |z| of the loop z^(n+1) - z^n + K_v k T = 0: below 1 it is stable.
 

@@ -8,7 +8,8 @@ import pytest
 from hand_rig import HAND, RB, HandRig
 
 from sioms.hand.control import Controller, Gains
-from sioms.hand.statics import damped_limit, damper_limit
+from sioms.hand.experiments.force import Loop, answer, quasi_static_limit
+from sioms.hand.statics import damped_limit, damper_limit, filtered_limit
 from sioms.plant.outline import disk
 from sioms.plant.planar import Mount
 
@@ -60,6 +61,21 @@ def test_at_twenty_hertz_the_damper_settles_below_its_limit_and_not_above() -> N
     below, above = (max(tail) - min(tail) for tail in (_force(share, 0.05, 3.0)[-10:] for share in (0.9, 1.3)))
     assert below < 0.01 and above > 0.2
     assert damped_limit(IN_SERIES, 0.0, 0.05) == pytest.approx(damper_limit(IN_SERIES, 0.05))
+
+
+@pytest.mark.parametrize(("sample_s", "filter_s"), [(2.5e-3, 0.05), (2.5e-3, 0.02), (2.5e-3, 0.0), (0.05, 0.0)])
+def test_what_the_hand_takes_for_a_stable_gain_is_one(sample_s: float, filter_s: float) -> None:
+    loop, mount = Loop(sample_s, filter_s), Mount(damping_ratio=1.0)
+    limit = min(quasi_static_limit(loop, mount), filtered_limit(filter_s, sample_s))
+    found = answer(loop, 0.95 * limit, mount, 1.0)
+    assert found.overshoot < 0.1 and found.swing < 0.2  # of a step; what is left of a slow approach swings, too
+
+
+def test_above_that_links_ring_long_before_the_quasi_static_limit() -> None:
+    loop, mount = Loop(2.5e-3, 0.02), Mount(damping_ratio=1.0)
+    gain = 1.6 * filtered_limit(0.02, 2.5e-3)
+    assert gain < 0.5 * quasi_static_limit(loop, mount)
+    assert answer(loop, gain, mount, 1.0).swing > 0.5
 
 
 @pytest.mark.parametrize("name", ["position", "spring", "damper"])
