@@ -32,6 +32,7 @@ VERBS: dict[str, Verb] = {
     "ends": lambda bank, now: bank.ends()[1:],
     "lose_place": lambda bank, now: bank.lose_place([0], "tried", now),
     "fault_text": lambda bank, now: bank.fault_text(0),
+    "check_reset": lambda bank, now: bank.check_reset([1], now),
     "reset": lambda bank, now: bank.reset([1]),
     "calibrate": lambda bank, now: bank.calibrate([0], [0.01]),
     "zero": lambda bank, now: bank.zero([0]),
