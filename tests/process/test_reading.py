@@ -71,10 +71,10 @@ def test_stamps_are_of_this_clock_and_rise_by_ticks(cell: sioms.Workcell) -> Non
 
 
 def test_history_reaches_as_far_as_the_ring(cell: sioms.Workcell) -> None:
-    with cell.open("force0") as node:  # a ring of 64
-        node.wait_new(200, 5.0)
+    with cell.open("force0") as node:  # a ring of 256
+        node.wait_new(400, 5.0)
         history = node.history(0)
-        assert 50 <= len(history) <= 64
+        assert 200 <= len(history) <= 256
         assert history[-1].number - history[0].number == len(history) - 1
         assert node.history(history[-1].number + 1000) == []
 
