@@ -44,6 +44,8 @@ Array = NDArray[np.float64]
 STRAIN, SHAPE = "strain", "shape"
 MOST_FRAMES = 100_000
 """Frames that a baseline may be averaged from."""
+BEHIND_NS = 20_000_000
+"""How long a driver may work on what came together before it leaves shapes out [ns]."""
 
 
 class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -119,13 +121,16 @@ class TactileNodes:
             block.corrected_by_driver = True
         self._sensor = self._make(_finger(settings, self.strain.n))
         self._stamp_ns = 0
+        self._left_out = 0
 
     @property
-    def blocks(self) -> tuple[AnalogBlock, AnalogBlock]:
+    def blocks(self) -> tuple[AnalogBlock, ...]:
         """Strain and shape."""
         return self.strain, self.shape
 
-    def take(self, raw: Array, flags: NDArray[np.int64], stamp_ns: int, now_ns: int) -> None:
+    def take(
+        self, raw: Array, flags: NDArray[np.int64], stamp_ns: int, now_ns: int, begun_ns: int | None = None
+    ) -> tuple[AnalogBlock, ...]:
         """Sense one frame and fill the blocks.
 
         Args:
@@ -133,19 +138,31 @@ class TactileNodes:
             flags: AnalogStatus of each; what is INVALID is not used.
             stamp_ns: time of the frame.
             now_ns: present time, at which the load node is read.
+            begun_ns: when the driver began with what came together with this frame; None: it is the only one.
+
+        Returns:
+            The blocks to be published: both; strains alone where frames come faster than this machine estimates
+            shapes. The next shape then has the flag OVERRUN.
         """
         readings = np.where(flags & int(AnalogStatus.INVALID), np.nan, raw)
         # a device's clock that began anew may lie a little before the frames already sensed
         self._stamp_ns = max(self._stamp_ns, stamp_ns)
-        sensed = self._sensor.frame(readings, self._stamp_ns, self._load(stamp_ns, now_ns))
+        strain, load = self._sensor.strain(readings, self._stamp_ns, self._load(stamp_ns, now_ns))
         lost = int(np.bitwise_or.reduce(flags)) & int(AnalogStatus.OVERRUN)
-        self.strain.data[:] = sensed.strain.strains
-        self.strain.flags[:] = lost | np.where(sensed.strain.saturated, int(AnalogStatus.SATURATED), 0)
-        self.shape.data[:] = self._numbers(sensed)
-        self.shape.flags[:] = lost
-        for block in self.blocks:
+        self.strain.data[:] = strain.strains
+        self.strain.flags[:] = lost | np.where(strain.saturated, int(AnalogStatus.SATURATED), 0)
+        self._left_out |= lost
+        new = self.blocks
+        if begun_ns is not None and self._kit.now_ns() - begun_ns > BEHIND_NS:
+            self._left_out |= int(AnalogStatus.OVERRUN)
+            new = new[:1]
+        else:
+            self.shape.data[:] = self._numbers(self._sensor.estimate(strain, load))
+            self.shape.flags[:], self._left_out = self._left_out, 0
+        for block in new:
             block.flags[np.isnan(block.data)] |= int(AnalogStatus.INVALID)
             block.stamp_ns = stamp_ns
+        return new
 
     def ioctl(self, block: BlockSpec, request: Request, argument: Any) -> Any:
         """Answer the requests named above.

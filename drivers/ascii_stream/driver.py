@@ -194,7 +194,7 @@ class AsciiStream(StreamDriver):
                 # the bytes behind a line's end came after it
                 arrived_ns = now_ns - round((len(data) - end) * self._character_ns)
                 if self._is_fresh(row, arrived_ns):
-                    self._take(row, arrived_ns)
+                    self._take(row, arrived_ns, now_ns)
                     good += 1
         if good:
             self._since_ns = min(self._since_ns, now_ns)
@@ -257,7 +257,7 @@ class AsciiStream(StreamDriver):
     def _device_us(self, number: float) -> int:
         return round(number * CLOCKS[self.settings.time][0]) % self._modulus_us
 
-    def _take(self, row: tuple[float, ...], now_ns: int) -> None:
+    def _take(self, row: tuple[float, ...], now_ns: int, begun_ns: int) -> None:
         arrived_ns = now_ns
         if self._clock is not None:
             now_ns = self._clock.to_host(self._device_us(row[0]), now_ns)
@@ -274,8 +274,8 @@ class AsciiStream(StreamDriver):
         self._stamp_ns = self._block.stamp_ns = max(now_ns, self._stamp_ns + 1)
         self.kit.publish(self._block, self._block.stamp_ns)
         if self._finger is not None:
-            self._finger.take(self._block.data, self._block.flags, self._block.stamp_ns, arrived_ns)
-            for derived in self._finger.blocks:
+            stamp_ns = self._block.stamp_ns
+            for derived in self._finger.take(self._block.data, self._block.flags, stamp_ns, arrived_ns, begun_ns):
                 self.kit.publish(derived, derived.stamp_ns)
 
 

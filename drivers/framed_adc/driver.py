@@ -243,8 +243,7 @@ class FramedAdc(StreamDriver):
         self._block.stamp_ns = self._clock.to_host(block.t_us, now_ns)
         self.kit.publish(self._block, self._block.stamp_ns)
         if self._finger is not None:
-            self._finger.take(data, self._block.flags, self._block.stamp_ns, now_ns)
-            for derived in self._finger.blocks:
+            for derived in self._finger.take(data, self._block.flags, self._block.stamp_ns, now_ns, now_ns):
                 self.kit.publish(derived, derived.stamp_ns)
         return True
 

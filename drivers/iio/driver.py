@@ -198,8 +198,7 @@ class Iio(StreamDriver):
             self._stamp_ns = self._block.stamp_ns = max(stamp_ns, self._stamp_ns + 1)
             self.kit.publish(self._block, self._block.stamp_ns)
             if self._finger is not None:
-                self._finger.take(row, self._block.flags, self._block.stamp_ns, now_ns)
-                for derived in self._finger.blocks:
+                for derived in self._finger.take(row, self._block.flags, self._block.stamp_ns, now_ns, now_ns):
                     self.kit.publish(derived, derived.stamp_ns)
             taken += 1
         self._scans += taken
@@ -332,9 +331,12 @@ class _Finger:
         self._offset = np.asarray(settings.element_offset, dtype=np.float64)
         self.blocks, self.ioctl = nodes.blocks, nodes.ioctl
 
-    def take(self, values: NDArray[np.float64], flags: NDArray[np.int64], stamp_ns: int, now_ns: int) -> None:
+    def take(
+        self, values: NDArray[np.float64], flags: NDArray[np.int64], stamp_ns: int, now_ns: int,
+        begun_ns: int | None = None,
+    ) -> tuple[AnalogBlock, ...]:  # fmt: skip
         """Sense one frame, as ``TactileNodes.take``."""
-        self._nodes.take((values - self._offset) * self._factor, flags, stamp_ns, now_ns)
+        return self._nodes.take((values - self._offset) * self._factor, flags, stamp_ns, now_ns, begun_ns)
 
 
 def _blocks(settings: IioSettings, kit: Kit) -> tuple[AnalogBlock, _Finger | None]:

@@ -209,7 +209,10 @@ class ShapeSensor:
         Raises:
             ValueError: wrong number of readings, or a stamp before the last one.
         """
-        strain, load = self.strain(raw, stamp_ns, reading)
+        return self.estimate(*self.strain(raw, stamp_ns, reading))
+
+    def estimate(self, strain: StrainFrame, load: Load | None = None) -> Sensed:
+        """Do the rest of `frame` after `strain`; of frames that come faster than that takes, some may do without."""
         self._last = self.shape(strain, load)
         return Sensed(strain, self._last)
 

@@ -33,6 +33,9 @@ class Rig:
         self.published: list[tuple[int, np.ndarray, int]] = []
         self.said: list[str] = []
 
+    def now_ns(self) -> int:
+        return round(self.now_s * 1e9)
+
     def log(self, level: str, text: str) -> None:
         self.said.append(f"{level}: {text}")
 

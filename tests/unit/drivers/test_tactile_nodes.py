@@ -13,6 +13,7 @@ import pytest
 
 from sioms.drivers.framed_adc.driver import FramedAdc
 from sioms.drivers.sim.tactile import SimTactile
+from sioms.drivers.tactile_nodes import BEHIND_NS
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description
@@ -251,3 +252,16 @@ def test_a_finger_of_another_number_of_elements_is_told(tmp_path):
     settings = {"line": {"serial": "/x", "baud": 921600}, "channels": 8, "shape": {"finger_file": FINGER}}
     with pytest.raises(ValueError, match="has 16 elements; the device has 8"):
         FramedAdc.describe("t0", msgspec.convert(settings, FramedAdc.Settings))
+
+
+def test_shapes_are_left_out_where_frames_come_faster_than_they_are_estimated(bench, hand):
+    nodes = bench.make(SimTactile, "tactile0", table())._finger
+    raw, flags, late_ns = np.zeros(nodes.strain.n), np.zeros(nodes.strain.n, dtype=np.int64), BEHIND_NS + 1
+    now = nodes._kit.now_ns()
+    assert nodes.take(raw, flags, now, now, now) == (nodes.strain, nodes.shape)
+    assert nodes.take(raw, flags, now + 1, now, now - late_ns) == (nodes.strain,)
+    assert nodes.shape.stamp_ns == now and nodes.strain.stamp_ns == now + 1
+    assert nodes.take(raw, flags, now + 2, now) == (nodes.strain, nodes.shape)  # the only one that has come
+    assert (nodes.shape.flags & AnalogStatus.OVERRUN).all() and not (nodes.strain.flags & AnalogStatus.OVERRUN).any()
+    nodes.take(raw, flags, now + 3, now, now)
+    assert not (nodes.shape.flags & AnalogStatus.OVERRUN).any()
