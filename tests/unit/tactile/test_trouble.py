@@ -52,7 +52,8 @@ class Finger:
             "line": {"serial": "/x", "baud": 12_000_000}, "channels": 16, "rate_hz": RATE, "scale": step, "unit": "%",
             "format": "f32", "shape": {"finger_file": FINGER},
         }  # fmt: skip
-        kit: Any = SimpleNamespace(publish=lambda block, stamp_ns: None, inputs={})
+        self.now_ns = 0
+        kit: Any = SimpleNamespace(publish=lambda block, stamp_ns: None, inputs={}, now_ns=lambda: self.now_ns)
         self.driver = FramedAdc("t0", msgspec.convert(settings, FramedAdc.Settings), kit)
         steps = self.driver.open()
         next(steps)
@@ -72,7 +73,8 @@ class Finger:
             time_us = self.number * 1_000_000 // RATE
             block = stream.SampleBlock(1, self.number % stream.SEQUENCE_MODULUS, time_us, 0, counts)
             data = frame(stream.build_samples(block, stream.Format.F32))
-            taken = self.driver.feed(data, time_us * 1000 + 10_000_000)
+            self.now_ns = time_us * 1000 + 10_000_000
+            taken = self.driver.feed(data, self.now_ns)
             assert taken == 1 or self.number == 1  # the first after the opening may be an old one
             self.seen.append(dict(zip(NAMES, self.driver.blocks[2].data.tolist(), strict=True)))
         return self.seen[-1]
