@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from sioms.protocol.flags import Reaction, Severity
 
-from .alarms import Alarm, AlarmFile, AlarmList
+from .alarms import OF_CLIENTS, Alarm, AlarmFile, AlarmList
 from .devices import DriverProcess, State
 from .names import Node, part_name
 
@@ -72,7 +72,8 @@ class AlarmKeeper:
         }  # fmt: skip
         for alarm in self:
             of_device = alarm.what in OF_DEVICES and alarm.device in plan.config.devices
-            if not of_device and (alarm.node, alarm.what) not in watched:
+            of_client = alarm.what in OF_CLIENTS and alarm.node in plan.names.nodes
+            if not of_device and not of_client and (alarm.node, alarm.what) not in watched:
                 self.take(alarm.node, alarm.device, alarm.what, Severity.NONE, "")
 
     def hung(self, device: DriverProcess, reason: str) -> None:

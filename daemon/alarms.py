@@ -20,6 +20,8 @@ from typing import Any
 from sioms.protocol.flags import Severity
 from sioms.protocol.text import printable
 
+OF_CLIENTS = ("drift",)
+"""What clients watch and tell: no driver knows it, so none ends it, and its death changes nothing about it."""
 MOST = 1000
 """Alarms that are kept; of more, those that are over go first, the oldest before the others."""
 LARGEST = 1 << 20
@@ -33,7 +35,7 @@ class Alarm:
     Attributes:
         node: the node of one channel or bit that it is about, or a device.
         device: whose node that is.
-        what: the column that is watched, "fault", "link" or "driver".
+        what: the column that is watched, "fault", "link" or "driver", or one of OF_CLIENTS.
         severity: a Severity, at present.
         text: why, a sentence.
         since: when its severity changed last [s, UTC].
@@ -122,7 +124,7 @@ class AlarmList:
         for alarm in [alarm for alarm in self._alarms.values() if alarm.device == device]:
             if alarm.what == "fault":
                 self.take(alarm.node, device, "fault", 0, "", now_s)
-            elif alarm.what not in ("link", "driver") and alarm.severity:
+            elif alarm.what not in ("link", "driver", *OF_CLIENTS) and alarm.severity:
                 self.take(alarm.node, device, alarm.what, Severity.INVALID, text, now_s)
 
     def restore(self, entries: Iterable[object]) -> str:

@@ -268,6 +268,8 @@ class Clients:
                 return self._workcell.alarms(session)
             case verbs.Acknowledge():
                 return self._workcell.acknowledge(session, message)
+            case verbs.TellAlarm():
+                return self._workcell.tell_alarm(session, message)
             case verbs.Reload():
                 return self._workcell.reload(session, number, message)
             case verbs.Cancel(waiting):

@@ -11,19 +11,29 @@ import re
 import time
 from typing import TYPE_CHECKING, Any
 
-from sioms.protocol.flags import PROTOCOL_VERSION, Right
+from sioms.protocol.flags import PROTOCOL_VERSION, Right, Severity
 from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import printable
 
-from .alarms import Alarm
+from .alarms import OF_CLIENTS, Alarm
 from .devices import State
 from .journals import Leash, for_reading
-from .names import shows
+from .names import part_name, shows
 from .rights import Peer
 from .sessions import LATER, Refused, Session
 
 if TYPE_CHECKING:
-    from sioms.protocol.verbs import Acknowledge, EmergencyStop, Hello, Reload, Report, Represent, Reset, Supervise
+    from sioms.protocol.verbs import (
+        Acknowledge,
+        EmergencyStop,
+        Hello,
+        Reload,
+        Report,
+        Represent,
+        Reset,
+        Supervise,
+        TellAlarm,
+    )  # fmt: skip
 
     from .clients import Clients
     from .server import Server
@@ -176,6 +186,21 @@ class WorkcellVerbs:
         if named is None and others and not parts + allowed:
             raise Refused(errno.EPERM, f"{what}: {session.peer.user} has no right to write or administer it")
         return [alarm.packed() for alarm in alarms.acknowledge(parts + allowed, str(session), note)]
+
+    def tell_alarm(self, session: Session, message: TellAlarm) -> None:
+        """Take what a client says of a condition that it watches."""
+        name, what, severity, text = message
+        where = f"tell an alarm of {name}"
+        node = self._clients.nodes.find(session, "tell an alarm", name, message.right)
+        if what not in OF_CLIENTS:
+            raise Refused(errno.EINVAL, f"{where}: {printable(what, 80)}; want one of: {', '.join(OF_CLIENTS)}")
+        if severity not in (Severity.NONE, Severity.MINOR, Severity.MAJOR):
+            raise Refused(errno.EINVAL, f"{where}: severity {severity}; want 0, 1 (minor) or 2 (major)")
+        if len(node.channels) != 1:
+            raise Refused(errno.EINVAL, f"{where}: it has {len(node.channels)} channels; want the node of one")
+        part = part_name(self._server.names.devices[node.device], node.block, node.channels[0], node.bit)
+        said = f"{printable(text, 300)} [told by {session}]" if severity else ""
+        self._server.alarms.take(part, node.device, what, severity, said)
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""

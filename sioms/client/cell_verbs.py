@@ -467,9 +467,10 @@ class WorkcellVerbs(Generic[M]):
 
         Returns:
             A map each: ``node`` (of one channel or bit, or a device), ``device``, ``what`` (the column that is watched,
-            "fault", "link" or "driver"), ``severity`` and ``worst`` (as Severity), ``state`` ("unacknowledged",
-            "acknowledged", "returned": to normal, and nobody has acknowledged it), ``text``, ``since`` [s, UTC],
-            ``times`` it has been raised, ``by``, ``at`` [s, UTC] and ``note`` of who has acknowledged it.
+            "fault", "link" or "driver", or "drift", which a program tells), ``severity`` and ``worst`` (as Severity),
+            ``state`` ("unacknowledged", "acknowledged", "returned": to normal, and nobody has acknowledged it),
+            ``text``, ``since`` [s, UTC], ``times`` it has been raised, ``by``, ``at`` [s, UTC] and ``note`` of who has
+            acknowledged it.
         """
         alarms: list[dict[str, Any]] = await self._ask("list alarms", verbs.Alarms())
         return alarms
@@ -491,6 +492,24 @@ class WorkcellVerbs(Generic[M]):
         what = f"acknowledge {node or 'all alarms'}"
         done: list[dict[str, Any]] = await self._ask(what, verbs.Acknowledge(node, printable(str(note), 200)))
         return done
+
+    @verb
+    async def tell_alarm(self, node: str, what: str, severity: int, text: str = "") -> None:
+        """Tell how bad a condition is that this program watches; it then stands in the list of alarms.
+
+        It stops nothing. It outlives this program, the driver and the daemon, and is over when a program says so.
+
+        Args:
+            node: of one channel.
+            what: "drift".
+            severity: 0: it is over; 1: minor; 2: major (as Severity).
+            text: why, a sentence of at most 300 characters.
+
+        Raises:
+            OSError: ENOENT, no such node; EPERM, without the right to write or to administer it; EINVAL, anything
+                else that is no such alarm.
+        """
+        await self._ask(f"tell an alarm of {node}", verbs.TellAlarm(node, what, int(severity), printable(text, 300)))
 
     @verb
     async def reload(self) -> None:

@@ -87,6 +87,7 @@ class ClientVerb(IntEnum):
     ALARMS = 23
     ACKNOWLEDGE = 24
     SUPERVISE = 25
+    TELL_ALARM = 26
     CANCEL = 30
 
 

@@ -350,6 +350,19 @@ class Acknowledge(
     note: Text
 
 
+class TellAlarm(
+    Message, on=FROM_CLIENT, verb=ClientVerb.TELL_ALARM, right=Right.WRITE | Right.ADMINISTER
+):  # fmt: skip
+    """Tell how bad a condition is that a client watches on a node of one channel; severity 0: it is over. It stops
+    nothing, and stands until a client says otherwise.
+    """
+
+    node: Name
+    what: Name
+    severity: Integer
+    text: Text
+
+
 class Cancel(Message, on=FROM_CLIENT, verb=ClientVerb.CANCEL):
     """Cancel a waiting request of this session. Answer: whether there was one."""
 

@@ -136,3 +136,10 @@ def test_what_is_no_file_is_told_and_holds_up_nobody(tmp_path, what):
     assert restored(path)[1]
     with pytest.raises(OSError):
         AlarmFile(str(path)).keep([GOOD])
+
+
+def test_what_a_client_watches_outlives_the_driver(alarms):
+    alarms.take("m.x", "m", "drift", 1, "backlash", 1.0)
+    alarms.take("m.x", "m", "force", 1, "force 3 N", 1.0)
+    alarms.lose("m", "it died", 2.0)
+    assert [(alarm.what, alarm.severity) for alarm in alarms] == [("drift", 1), ("force", 3)]

@@ -157,6 +157,7 @@ ON_NODES: dict[str, tuple[Callable[[Workcell, str], int | None], list[Right]]] =
     "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, ""), [Right.STOP]),
     "reset": (lambda c, node: c.ask("eva", ClientVerb.RESET, node), [EITHER]),
     "acknowledge": (lambda c, node: c.ask("eva", ClientVerb.ACKNOWLEDGE, node, ""), [EITHER]),
+    "tell": (lambda c, node: c.ask("eva", ClientVerb.TELL_ALARM, node, "drift", 1, "worn"), [EITHER]),
 }
 """What is asked for on a node, and the rights that it takes: one of each entry."""
 ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
@@ -195,6 +196,7 @@ def test_no_verb_is_left_out() -> None:
         ClientVerb.SUPERVISE,
         ClientVerb.RESET,
         ClientVerb.ACKNOWLEDGE,
+        ClientVerb.TELL_ALARM,
         ClientVerb.RELOAD,
         ClientVerb.JOURNAL,
     }
@@ -480,3 +482,21 @@ def test_sessions_of_keys_end_when_their_gateway_is_none_any_more(gateway: Workc
     gateway.server.config = SimpleNamespace(workcell=WorkcellTable(), quota=QuotaTable())
     gateway.clients.take_up_rights(_keys())
     assert gateway.sessions["eva"] not in gateway.clients.sessions
+
+
+def test_a_client_tells_drifts_of_single_channels_and_nothing_else(cell: Workcell) -> None:
+    cell.grant((["write"], "eva", "*"))
+
+    def tell(*arguments: object) -> int | None:
+        return cell.ask("eva", ClientVerb.TELL_ALARM, *arguments)
+
+    assert tell("io0", "drift", 1, "worn") == 0
+    (alarm,) = cell.server.alarms
+    assert (alarm.node, alarm.what, alarm.severity) == ("io0", "drift", 1)
+    assert alarm.text == "worn [told by pid 1 (eva)]"
+    for what in ("fault", "link", "driver", "data", ""):  # what drivers and the daemon tell is theirs
+        assert tell("io0", what, 1, "") == errno.EINVAL
+    for severity in (-1, 3, 4, 1 << 40):
+        assert tell("io0", "drift", severity, "") == errno.EINVAL
+    assert tell("nowhere", "drift", 1, "") == errno.ENOENT
+    assert tell("io0", "drift", 0, "") == 0 and [a.state for a in cell.server.alarms] == ["returned"]
