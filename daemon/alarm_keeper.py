@@ -1,20 +1,22 @@
 """The daemon's alarms: what drivers tell and what it sees itself, in the list, in the log, and kept over its end.
 
-Concurrency: everything runs in the daemon's loop.
+Concurrency: everything runs in the daemon's loop, but for a thread that waits for the disk, so that nobody else does.
 """
 
 from __future__ import annotations
 
+import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from sioms.protocol.flags import Reaction, Severity
 
 from .alarms import OF_CLIENTS, Alarm, AlarmFile, AlarmList
 from .devices import DriverProcess, State
 from .names import Node, part_name
+from .realtime import end_promptly
 
 if TYPE_CHECKING:
     from .loading import Plan
@@ -38,7 +40,9 @@ class AlarmKeeper:
         self._server = server
         self._list = AlarmList(self._changed)
         self._file = AlarmFile(path)
-        self._is_kept = True
+        self._is_kept, self._looks = True, False
+        self._writer: threading.Thread | None = None
+        self._failure = ""
         try:
             why = self._list.restore(self._file.load())
         except (OSError, ValueError) as error:
@@ -122,18 +126,48 @@ class AlarmKeeper:
             "warning" if event == "raised" else "info", "alarm", device=alarm.device, node=alarm.node, what=alarm.what,
             change=event, severity=Severity(alarm.severity).name.lower(), text=alarm.text, **by,
         )  # fmt: skip
-        if self._is_kept:
-            self._is_kept = False
-            self._server.loop.after(KEPT_S, self._keep)
+        self._is_kept = False
+        if not self._looks:
+            self._look_later()
 
-    def _keep(self) -> None:
-        self._is_kept = True
+    def _look_later(self) -> None:
+        self._looks = True
+        self._server.loop.after(KEPT_S, self._look)
+
+    def _look(self) -> None:
+        """Have kept what has changed, when what was to be kept before is; and look how that ended."""
+        self._looks = False
+        if self._writer is not None and self._writer.is_alive():
+            self._look_later()
+            return
+        self._tell()
+        if not self._is_kept:
+            self._is_kept = True
+            self._writer = threading.Thread(target=self._keep, args=(self._list.entries(),), daemon=True, name="alarms")
+            try:
+                self._writer.start()
+            except RuntimeError:  # no memory, or no more threads
+                self._writer = None
+                self._keep(self._list.entries())
+            self._look_later()
+
+    def _keep(self, entries: list[dict[str, Any]]) -> None:
+        if threading.current_thread() is self._writer:
+            end_promptly()
         try:
-            self._file.keep(self._list.entries())
+            self._file.keep(entries)
         except OSError as error:
-            self._server.log("error", "not kept", what="alarms", path=self._file.path, why=error.strerror)
+            self._failure = error.strerror or str(error)
+
+    def _tell(self) -> None:
+        if self._failure:
+            self._server.log("error", "not kept", what="alarms", path=self._file.path, why=self._failure)
+            self._failure = ""
 
     def close(self) -> None:
         """Keep what has changed last."""
+        if self._writer is not None:
+            self._writer.join()
         if not self._is_kept:
-            self._keep()
+            self._keep(self._list.entries())
+        self._tell()

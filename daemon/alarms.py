@@ -186,7 +186,7 @@ def _checked(entry: object) -> Alarm:
 
 
 class AlarmFile:
-    """Where alarms are kept over the daemon's end: a line of JSON, written over the one before.
+    """Where alarms are kept over the daemon's end: a line of JSON, replaced as a whole by the next one.
 
     Args:
         path: of the file.
@@ -212,7 +212,7 @@ class AlarmFile:
         if len(line) > LARGEST:
             raise ValueError(f"it is larger than {LARGEST >> 20} MiB")
         try:
-            found = json.loads(line or b"[]")
+            found = json.loads(line)
         except RecursionError:
             raise ValueError("lists nested too deep") from None
         if not isinstance(found, list):
@@ -228,19 +228,35 @@ class AlarmFile:
         return fd
 
     def keep(self, entries: list[dict[str, Any]]) -> None:
-        """Keep alarms; without any there is no file.
+        """Keep alarms; without any there is no file. What is kept is on the disk when this returns.
 
         Raises:
-            OSError: they cannot be written.
+            OSError: they cannot be written; what was kept before is there still.
         """
-        if not entries:
+        with suppress(FileNotFoundError):
+            os.close(self._open(os.O_RDONLY))  # what is no file is not replaced
+        if entries:
+            self._replace(json.dumps(entries, separators=(",", ":")).encode() + b"\n")
+        else:
             with suppress(FileNotFoundError):
                 os.unlink(self.path)
-            return
-        data = json.dumps(entries, separators=(",", ":")).encode() + b"\n"
-        fd = self._open(os.O_WRONLY | os.O_CREAT)
+        folder = os.open(os.path.dirname(self.path) or ".", os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
-            os.pwrite(fd, data, 0)  # one line in one call: a kill leaves the old one or this one
-            os.ftruncate(fd, len(data))
+            os.fsync(folder)
         finally:
-            os.close(fd)
+            os.close(folder)
+
+    def _replace(self, data: bytes) -> None:
+        fresh = f"{self.path}.new"
+        with suppress(FileNotFoundError):
+            os.unlink(fresh)  # of a daemon that was killed
+        fd = os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+        try:
+            with open(fd, "wb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(fd)
+            os.replace(fresh, self.path)
+        except OSError:
+            os.unlink(fresh)
+            raise

@@ -36,6 +36,21 @@ def positive(text: str) -> float:
     return value
 
 
+LONGEST_S = 1e9
+"""What is further away than so many seconds, 31 years, is a slip."""
+
+
+def seconds(text: str) -> float:
+    """Read a time of either sign [s]."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not abs(value) <= LONGEST_S:
+        raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds, of {LONGEST_S:g} s at most")
+    return value
+
+
 def place(text: str, example: str) -> tuple[str, int]:
     """Take a place to listen at, ``HOST:PORT``, apart; an address of IPv6 stands in brackets.
 

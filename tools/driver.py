@@ -9,6 +9,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
+from sioms.arguments import positive
+
 from .cell import print_json, table
 
 ABOUT = (
@@ -45,7 +47,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument("config", metavar="CONFIG", type=Path, help="configuration (TOML)")
     one.add_argument("device", metavar="DEVICE", help="name of the device in it")
     one.add_argument("-o", "--output", metavar="FILE", type=Path, help="output file (default: DEVICE.trace)")
-    one.add_argument("--seconds", metavar="N", type=float, help="duration (default: until interrupted)")
+    one.add_argument("--seconds", metavar="N", type=positive, help="duration (default: until interrupted)")
     one.add_argument("--socket", metavar="PATH", default="", help="socket of the daemon (default: a temporary path)")
     one = actions.add_parser("replay", help="run a driver against a recorded trace")
     one.add_argument("trace", metavar="TRACE", type=Path, help="file of sioms driver trace")

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from sioms.whole_file import write_whole
+
 TOOLS = ("sioms", "siomsd", "devin", "devout", "sdev", "smarkers")
 UNSEEN = ("home", "root", "run/user", "tmp", "var/tmp")
 """Folders that the unit's ProtectHome and PrivateTmp hide from the service."""
@@ -56,12 +58,15 @@ class Item:
         path.parent.mkdir(parents=True, exist_ok=True)
         fresh = path.with_name(f".{path.name}.new")
         fresh.unlink(missing_ok=True)
-        if self.link:
-            fresh.symlink_to(self.link)
-        else:
-            fresh.write_text(self.text, encoding="utf-8")
-            fresh.chmod(self.mode)
-        fresh.replace(path)
+        try:
+            if self.link:
+                fresh.symlink_to(self.link)
+            else:
+                write_whole(fresh, self.text)
+                fresh.chmod(self.mode)
+            fresh.replace(path)
+        finally:
+            fresh.unlink(missing_ok=True)
 
 
 def add_parser(subparsers: Any) -> None:

@@ -1,11 +1,11 @@
-"""Positions that outlive their driver process: a small file for each block of axes, mapped into memory.
+"""Positions that outlive their driver process: a small file for each block of axes, written in place.
 
 While an axis is at rest (told to, and its reading still for STILL_NS) its entry holds where it is, marked "at rest";
-the mark is taken away before anything
-moves it, and comes back, with the new place, when it rests again. That is a store into memory: no call that
-could delay a tick, and what a killed process has stored is in the file. What the kernel has not written out when
-the power goes is lost, so entries of an earlier boot count only if the process that wrote them ended in order.
-Why so: docs/decisions/0070-positions-over-a-restart.md.
+the mark is taken away before anything moves it, and comes back, with the new place, when it rests again. That is a
+write into the kernel's memory, at the begin and the end of a motion, and what a killed process has written is in the
+file. What the kernel has not written out when the power goes is lost, so entries of an earlier boot count only if the
+process that wrote them ended in order. Where a mark cannot be taken away (EIO, a full disk), the file is.
+Why so: docs/decisions/0070-positions-over-a-restart.md, 0610-state-files-are-never-mapped.md.
 
 Concurrency: the one thread of the driver process. A process that starts replaces the file by one of its own, so
 that one on its way out cannot write into it.
@@ -14,9 +14,9 @@ that one on its way out cannot write into it.
 from __future__ import annotations
 
 import errno
-import mmap
 import os
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from struct import Struct
 from typing import NamedTuple
 
@@ -134,12 +134,12 @@ class PositionFile:
         self._why = "nothing was kept of it"
         known = self._read(path, boot)
         self._before.update({name: entry for name, entry in known.items() if name in self._before})
-        data = encode(Contents(self._before, False, boot))
-        self._map = mmap.mmap(_replace(path, data), len(data))
-        count, first = len(settings), len(data) - 24 * len(settings)
-        self._state = np.frombuffer(self._map, "<i8", count, first)
-        self._raw = np.frombuffer(self._map, "<f8", count, first + 8 * count)
-        self._position = np.frombuffer(self._map, "<f8", count, first + 16 * count)
+        data = bytearray(encode(Contents(self._before, False, boot)))
+        self._path, self._data, self._fd = path, data, _replace(path, data)
+        self._first, count = len(data) - 24 * len(settings), len(settings)
+        self._state = np.frombuffer(data, "<i8", count, self._first)
+        self._raw = np.frombuffer(data, "<f8", count, self._first + 8 * count)
+        self._position = np.frombuffer(data, "<f8", count, self._first + 16 * count)
         self._tolerance = np.array([axis.restore.tolerance if axis.restore else 0.0 for axis in settings])
         self._still_at, self._still_ns = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
 
@@ -190,28 +190,82 @@ class PositionFile:
         at_rest = at_rest & (now_ns - self._still_ns >= STILL_NS)
         state = at_rest * AT_REST + homed * HOMED
         changed = (state != self._state) | (at_rest & ((raw != self._raw) | (position != self._position)))
-        if not np.count_nonzero(changed):
+        if self._fd < 0 or not np.count_nonzero(changed):
             return
-        self._state[changed] = 0
-        self._raw[changed], self._position[changed] = raw[changed], position[changed]
-        self._state[changed] = state[changed]
+        try:
+            self._enter(changed, state, changed & at_rest, raw, position)
+        except OSError as error:
+            self._give_up(error)
+
+    def _enter(
+        self,
+        changed: NDArray[np.bool_],
+        state: NDArray[np.int64],
+        rests: NDArray[np.bool_],
+        raw: NDArray[np.float64],
+        position: NDArray[np.float64],
+    ) -> None:
+        """Write what has changed; where an axis is counts only at rest, so it is written unmarked, then marked."""
+        unmarked = np.where(rests, 0, state)
+        differs = changed & (unmarked != self._state)
+        if np.count_nonzero(differs):
+            self._state[differs] = unmarked[differs]
+            self._write(0, differs)
+        if np.count_nonzero(rests):
+            self._raw[rests], self._position[rests] = raw[rests], position[rests]
+            self._write(1, rests)
+            self._write(2, rests)
+            self._state[rests] = state[rests]
+            self._write(0, rests)
+
+    def _write(self, column: int, rows: NDArray[np.bool_]) -> None:
+        """Write rows of a column, and what lies between them."""
+        chosen = np.flatnonzero(rows)
+        first = self._first + 8 * column * len(rows)
+        self._put(first + 8 * int(chosen[0]), first + 8 * int(chosen[-1]) + 8)
+
+    def _put(self, first: int, end: int) -> None:
+        if os.pwrite(self._fd, memoryview(self._data)[first:end], first) != end - first:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    def _give_up(self, error: OSError) -> None:
+        """Keep nothing from now on, and see that nobody believes what has been kept."""
+        self._log("error", f"write {self._path}: {error.strerror}; positions are not kept until the next start")
+        with suppress(OSError):
+            os.ftruncate(self._fd, 0)
+        with suppress(OSError):
+            if os.path.samestat(os.fstat(self._fd), os.stat(self._path)):  # and not a successor's
+                _forget(self._path, self._log)
+        os.close(self._fd)
+        self._fd = -1
 
     def close(self) -> None:
         """Say that the process ended in order, and wait until that is on the disk."""
-        self._map.flush()
-        CLOSED.pack_into(self._map, CLOSED_AT, 1)
-        self._map.flush()
+        if self._fd < 0:
+            return
+        try:
+            os.fsync(self._fd)
+            CLOSED.pack_into(self._data, CLOSED_AT, 1)
+            self._put(CLOSED_AT, CLOSED_AT + CLOSED.size)
+            os.fsync(self._fd)
+        except OSError as error:
+            self._give_up(error)
+            return
+        os.close(self._fd)
+        self._fd = -1
 
 
 def _at_once(path: str, flags: int) -> int:
     return os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would hold up the driver
 
 
-def _replace(path: str, data: bytes) -> int:
+def _replace(path: str, data: bytes | bytearray) -> int:
     """Put a new file in the place of an old one, on the disk before this returns; return its descriptor."""
     os.makedirs(os.path.dirname(path), exist_ok=True)
     fresh = f"{path}.new"
-    fd = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC, 0o640)
+    with suppress(FileNotFoundError):
+        os.unlink(fresh)  # of a process that was killed, or no file at all
+    fd = os.open(fresh, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
     try:
         if os.write(fd, data) != len(data):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), fresh)

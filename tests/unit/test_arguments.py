@@ -6,8 +6,9 @@ import argparse
 
 import pytest
 
-from sioms.arguments import place, positive, whole
+from sioms.arguments import place, positive, seconds, whole
 from sioms.reconcile.command import main
+from sioms.tools.front import main as front
 
 
 def test_numbers_that_make_sense_are_read() -> None:
@@ -26,6 +27,24 @@ def test_what_is_no_count_is_refused(text: str) -> None:
 def test_what_is_no_size_is_refused(text: str) -> None:
     with pytest.raises(argparse.ArgumentTypeError, match="above 0"):
         positive(text)
+
+
+@pytest.mark.parametrize("text", ["inf", "-inf", "nan", "1e300", "-1.1e9", "", "soon"])
+def test_what_is_no_time_is_refused(text: str) -> None:
+    assert seconds("-2.5") == -2.5
+    with pytest.raises(argparse.ArgumentTypeError, match="no time in seconds"):
+        seconds(text)
+
+
+@pytest.mark.parametrize("option", [("--from", "inf"), ("--to", "nan"), ("--from=-inf",)])
+@pytest.mark.parametrize("action", ["cut", "export", "plot"])
+def test_a_part_of_a_recording_has_a_finite_beginning_and_end(
+    action: str, option: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        front(["log", action, "no.mcap", "-o", "other.mcap", *option])
+    assert stopped.value.code == 2
+    assert "no time in seconds" in capsys.readouterr().err
 
 
 def test_places_to_listen_at_are_read() -> None:

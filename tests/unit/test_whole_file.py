@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import resource
 import subprocess
 import sys
@@ -57,3 +58,60 @@ def test_links_modes_and_what_is_no_file_stay_what_they_are(tmp_path: Path) -> N
     assert not Path("/dev/null").is_file()
     with pytest.raises(OSError, match=r"write .*/no/such: no such file or directory"):
         write_whole(tmp_path / "no" / "such", "")
+
+
+TREE = Path(__file__).resolve().parents[2]
+DIRECT = {
+    "daemon": ("alarms.py",),  # as a whole, in a thread of its own
+    "drivers": (),
+    "sioms/client": ("keys.py",),  # as a whole, by a folder of its own
+    "sioms/gateway": (),
+    "sioms/protocol": (),
+    "sioms/recording": ("export.py", "rewrite.py", "live/box.py"),  # beside, and renamed; a table has its own name
+    "sioms/sdk": ("trace.py",),  # a line at a time
+    "sioms/tactile": ("command/shape.py",),  # a table, a line at a time
+    "sioms/reconcile": (
+        "report/__init__.py", "report/effects.py", "report/effects_sensors.py",  # pages for people
+        "command/damaged.py", "command/selftest.py", "command/selftest_sensors.py", "command/__init__.py",
+        "live/axis.py", "live/force.py",  # what goes with a record, made anew with it
+    ),
+    "tools": ("generate.py", "front.py", "demo/story.py", "demo/wire.py"),
+}  # fmt: skip
+"""Modules that write files with their own hands; simulators and rigs apart."""
+
+
+def _writes(path: Path) -> bool:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if not isinstance(node, ast.Call):
+            continue
+        if isinstance(node.func, ast.Attribute) and node.func.attr in ("write_text", "write_bytes", "writelines"):
+            return True
+        name = node.func.id if isinstance(node.func, ast.Name) else getattr(node.func, "attr", "")
+        modes = [*node.args[:2], *(k.value for k in node.keywords if k.arg == "mode")] if name == "open" else []
+        if any(isinstance(m, ast.Constant) and m.value in ("w", "wb", "a", "ab", "x", "xb", "w+", "r+") for m in modes):
+            return True
+    return False
+
+
+@pytest.mark.parametrize("folder", DIRECT)
+def test_files_that_are_read_again_are_written_as_a_whole(folder: str) -> None:
+    """By ``write_whole``, or by one of the parts that have reasons to do otherwise."""
+    found = {
+        str(path.relative_to(TREE / folder))
+        for path in (TREE / folder).rglob("*.py")
+        if "simulat" not in str(path) and "driver/rig" not in str(path) and _writes(path)
+    }
+    assert found == set(DIRECT[folder])
+
+
+def test_no_file_of_a_folder_is_mapped_into_memory() -> None:
+    """Who truncates it, or a full disk, would end the process by SIGBUS; pages are sealed memory without a name."""
+    mapping = {
+        str(path.relative_to(TREE))
+        for folder in DIRECT for path in (TREE / folder).rglob("*.py")
+        if "mmap.mmap(" in path.read_text(encoding="utf-8") or "memmap" in path.read_text(encoding="utf-8")
+    }  # fmt: skip
+    assert mapping == {
+        "daemon/devices.py", "daemon/journals.py", "daemon/shared.py", "sioms/recording/live/replay.py",
+        "sioms/recording/live/taps.py", "sioms/sdk/inputs.py", "sioms/sdk/pages.py", "sioms/sdk/runtime.py",
+    }  # fmt: skip

@@ -13,6 +13,7 @@ from collections.abc import Callable, Generator
 from importlib import import_module
 from typing import Any, Protocol, TypeVar
 
+from sioms.arguments import positive
 from sioms.hand.kinematics import Hand
 from sioms.hand.touch import Event, Failed, Manner, Reading, Sensed, Setpoint
 
@@ -37,9 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--fingers", nargs=2, default=["touch1.shape", "touch2.shape"], metavar="NODE",
         help="what each finger feels (default touch1.shape touch2.shape)",
     )  # fmt: skip
-    parser.add_argument("--force", type=float, default=1.0, metavar="N", help="internal force in newtons (default 1)")
     parser.add_argument(
-        "--time", type=float, default=HOLD_S, metavar="S", help=f"how long `hold` holds (default {HOLD_S:g} s)"
+        "--force", type=positive, default=1.0, metavar="N", help="internal force in newtons (default 1)"
+    )
+    parser.add_argument(
+        "--time", type=positive, default=HOLD_S, metavar="S", help=f"how long `hold` holds (default {HOLD_S:g} s)"
     )
 
 

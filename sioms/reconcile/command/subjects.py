@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sioms.arguments import positive, whole
+from sioms.whole_file import write_whole
 
 Say = Callable[[str], None]
 Args = argparse.Namespace
@@ -102,10 +103,10 @@ def _live_axis(args: Args, folder: Path, say: Say) -> tuple[Any, float]:
 def _write_axis(args: Args, verdict: Any) -> None:
     from sioms.reconcile.model_file import write_model
 
-    (args.out / "model.toml").write_text(write_model(verdict.model))
+    write_whole(args.out / "model.toml", write_model(verdict.model))
     if verdict.experiment is not None:
         lines = ["command", *(f"{x:.9g}" for x in verdict.experiment.command)]
-        (args.out / "experiment.csv").write_text("\n".join(lines) + "\n")
+        write_whole(args.out / "experiment.csv", "\n".join(lines) + "\n")
 
 
 def _install_model(args: Args, verdict: Any) -> str:
@@ -244,7 +245,7 @@ def _live_force(args: Args, folder: Path, say: Say) -> tuple[Any, float]:
 def _write_force(args: Args, verdict: Any) -> None:
     from sioms.reconcile.force.model_file import to_toml
 
-    (args.out / "model.toml").write_text(to_toml(verdict.model))
+    write_whole(args.out / "model.toml", to_toml(verdict.model))
 
 
 SUBJECTS = {

@@ -30,6 +30,7 @@ from sioms.tactile.files import read_nominal
 from sioms.tactile.finger import Finger, from_toml
 from sioms.tactile.finger import to_toml as finger_to_toml
 from sioms.tactile.touches import Recording
+from sioms.whole_file import write_whole
 
 if TYPE_CHECKING:
     from sioms.reconcile.finger.plan import Bench
@@ -214,14 +215,14 @@ def _touches(got: Mapping[str, Any], where: str) -> tuple[Any, Any, Any] | None:
 
 def write_models(verdict: SensorVerdict, model: Path | None, out: Path) -> None:
     """Write model.toml (switchable effects) and finger.toml, what driver and estimator load."""
-    (out / "model.toml").write_text(to_toml(verdict.model))
+    write_whole(out / "model.toml", to_toml(verdict.model))
     nominal: Finger | None = None
     if model is not None and model.is_file() and model.suffix == ".toml":
         text = read_text(model)
         if "finger" not in toml_of(text):
             nominal = from_toml(text)
     dead = tuple(int(p.value) for e in verdict.effects if e.name == "dead_element" for p in e.parameters)
-    (out / "finger.toml").write_text(finger_to_toml(corrected(_named_only(verdict.model), nominal, dead)))
+    write_whole(out / "finger.toml", finger_to_toml(corrected(_named_only(verdict.model), nominal, dead)))
 
 
 def _named_only(model: SensorModel) -> SensorModel:

@@ -16,6 +16,7 @@ import sioms
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
 from sioms.reconcile.verdict import Outcome, Verdict
+from sioms.whole_file import write_whole
 
 V = TypeVar("V", bound=Verdict)
 E = TypeVar("E", bound="Named")
@@ -137,9 +138,7 @@ def install(text: str, path: Path, socket: str | None, what: str, take_up: Calla
     Returns:
         A sentence on what was done.
     """
-    fresh = path.with_name(path.name + ".new")
-    fresh.write_text(text, encoding="utf-8")
-    fresh.replace(path)
+    write_whole(path, text)
     try:
         with sioms.Workcell(socket, "reconcile") as cell:
             return f"{what} installed as {path}{take_up(cell)}"

@@ -19,6 +19,7 @@ from sioms.recording.live.box import KEPT_S, Box
 from sioms.recording.live.recorder import Recorder, be_prompt
 from sioms.recording.reader import Recording
 from sioms.recording.story import happened, sentence, tell, utc
+from sioms.whole_file import write_whole
 
 from .record import size
 
@@ -133,8 +134,8 @@ def _keep(folder: Path, memory: int, seconds: float) -> int:
         return 0
     be_prompt()
     keeper = folder / KEEPER
-    keeper.write_text(f"{os.getpid()}\n")
     try:
+        write_whole(keeper, f"{os.getpid()}\n")
         recorder.run(lambda: ended)
     finally:
         keeper.unlink(missing_ok=True)

@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from sioms.arguments import seconds
 from sioms.documents import json_text
 from sioms.recording.export import FORMATS, export
 from sioms.recording.messages import Event
@@ -55,8 +56,10 @@ def add_parser(subparsers: Any) -> None:
 
 
 def _add_span(parser: Any) -> None:
-    parser.add_argument("--from", dest="start", type=float, metavar="SECONDS", help="begin so long after its beginning")
-    parser.add_argument("--to", dest="end", type=float, metavar="SECONDS", help="end so long after its beginning")
+    parser.add_argument(
+        "--from", dest="start", type=seconds, metavar="SECONDS", help="begin so long after its beginning"
+    )
+    parser.add_argument("--to", dest="end", type=seconds, metavar="SECONDS", help="end so long after its beginning")
 
 
 def run(args: argparse.Namespace) -> int:

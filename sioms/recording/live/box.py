@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 import time
 import zlib
 from collections import deque
@@ -120,6 +121,8 @@ class Box:
             for old in sorted(self._folder.glob("*.mcap"))[:-FILES]:
                 old.unlink()
             status = 0
+        except OSError as error:
+            print(f"sioms blackbox: write {path}: {error.strerror or error}; it is lost", file=sys.stderr, flush=True)
         finally:
             os._exit(status)
 
@@ -130,12 +133,14 @@ class Box:
             OSError: it cannot be written.
         """
         live = path.with_suffix(".part")
-        with open(live, "wb") as file:
-            file.write(mcap.header(LIBRARY) + mcap.metadata("blackbox", {"why": self._why}) + self._definitions)
-            for _, piece in self._pieces:
-                file.write(_unpacked(piece))
-        rewrite([str(live)], str(path))
-        live.unlink()
+        try:
+            with open(live, "wb") as file:
+                file.write(mcap.header(LIBRARY) + mcap.metadata("blackbox", {"why": self._why}) + self._definitions)
+                for _, piece in self._pieces:
+                    file.write(_unpacked(piece))
+            rewrite([str(live)], str(path))
+        finally:
+            live.unlink(missing_ok=True)
 
     def close(self) -> None:
         """Wait for boxes that are being written."""

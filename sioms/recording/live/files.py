@@ -59,27 +59,34 @@ class LiveFile:
         self._begin()
 
     def _begin(self) -> None:
-        self._part += 1
-        name = self._name
-        self.path = str(name.with_name(f"{name.stem}-{self._part:04d}{name.suffix}") if self._rotates else name)
+        """Begin the next file; where that fails, the present one is as it was."""
+        part, name = self._part + 1, self._name
+        path = str(name.with_name(f"{name.stem}-{part:04d}{name.suffix}") if self._rotates else name)
+        data = mcap.header(LIBRARY) + self._definitions
         try:
-            self._fd = os.open(self.path, _FLAGS, 0o644)
+            fd = os.open(path, _FLAGS, 0o644)
         except FileExistsError:
-            text = f"record to {self.path}: it is there already; name another file, or remove it"
+            text = f"record to {path}: it is there already; name another file, or remove it"
             raise OSError(errno.EEXIST, text) from None
-        self._size, self._began_s = 0, monotonic()
-        self._write(mcap.header(LIBRARY) + self._definitions)
+        except OSError as error:
+            raise _told(path, error) from None
+        try:
+            _append(fd, data)
+        except OSError as error:
+            os.close(fd)
+            os.unlink(path)
+            raise _told(path, error) from None
+        self.path, self._part, self._fd = path, part, fd
+        self._size, self._began_s = len(data), monotonic()
 
     def _write(self, data: bytes) -> None:
         """Write whole records, or cut off what did not fit and raise why."""
-        view, done = memoryview(data), 0
         try:
-            while done < len(data):
-                done += os.write(self._fd, view[done:])
+            _append(self._fd, data)
         except OSError as error:
             with suppress(OSError):
                 os.ftruncate(self._fd, self._size)
-            raise OSError(error.errno, f"record to {self.path}: {(error.strerror or '').lower()}") from None
+            raise _told(self.path, error) from None
         self._size += len(data)
 
     def define(self, records: bytes) -> None:
@@ -96,11 +103,12 @@ class LiveFile:
         self._packers = [packer for packer in self._packers if packer.poll() is None]
         full = self._most_bytes and self._size >= self._most_bytes
         if full or (self._most_s and monotonic() - self._began_s >= self._most_s):
-            os.close(self._fd)
-            if self._pack:
-                command = [sys.executable, "-P", "-m", "sioms.recording.live.packing", self.path]
-                self._packers.append(subprocess.Popen(command, preexec_fn=lambda: os.nice(19)))
+            path, fd = self.path, self._fd
             self._begin()
+            os.close(fd)
+            if self._pack:
+                command = [sys.executable, "-P", "-m", "sioms.recording.live.packing", path]
+                self._packers.append(subprocess.Popen(command, preexec_fn=lambda: os.nice(19)))
 
     def drop(self) -> None:
         """Remove the file: nothing was recorded."""
@@ -115,3 +123,13 @@ class LiveFile:
                 rewrite([self.path], self.path)
         for packer in self._packers:
             packer.wait()
+
+
+def _append(fd: int, data: bytes) -> None:
+    view, done = memoryview(data), 0
+    while done < len(data):
+        done += os.write(fd, view[done:])
+
+
+def _told(path: str, error: OSError) -> OSError:
+    return OSError(error.errno, f"record to {path}: {(error.strerror or '').lower()}")

@@ -16,6 +16,7 @@ from sioms.tactile.command.tables import calibrated, tables
 from sioms.tactile.finger import to_toml
 from sioms.tactile.live.prober import LENGTH_M, Prober, Touch, write_nominal
 from sioms.tactile.live.simulated import FINGER, simulated
+from sioms.whole_file import write_whole
 
 ANGLES_DEG = 143.0 - 9.22 * np.arange(16)
 RADII_M = (0.0, 0.5e-3, 1.59e-3, 3.9e-3, 6.01e-3, 7.55e-3, 9.3e-3, 12.3e-3, 18.71e-3, 25.25e-3, math.inf)
@@ -67,7 +68,7 @@ def experiment(args: argparse.Namespace) -> int:
     if not args.recorded:
         probe(args.output, args.finger or FINGER, args.quick, progress)
     data, result = calibrated(args.output, progress)
-    (args.output / "finger.toml").write_text(to_toml(result.finger), encoding="utf-8")
+    write_whole(args.output / "finger.toml", to_toml(result.finger))
     page = Page("Experiments on a finger, beside the published ones")
     page.text(f"The finger: {args.finger or FINGER}." if not args.recorded else f"Recordings in {args.output}.")
     for warning in result.warnings:

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 import sioms
 from sioms.lab.loading_axis import LoadingAxis
 from sioms.lab.stopping import ExperimentStopped
+from sioms.whole_file import write_whole
 
 Floats = NDArray[np.float64]
 Frames = tuple[Floats, Floats, Floats]  # raw (n, ns), time [s], force [N/m]
@@ -282,4 +283,4 @@ def write_nominal(path: Path, angles_rad: Floats) -> None:
         "element_angle_deg": np.degrees(angles_rad).tolist(), "element_radius_mm": [10.3] * len(angles_rad),
         "gain_percent_strain_per_percent_output": [3.0] * len(angles_rad), "output_noise_percent": 0.05,
     }  # fmt: skip
-    path.write_text(json.dumps(nominal, indent=1), encoding="utf-8")
+    write_whole(path, json.dumps(nominal, indent=1))

@@ -1,11 +1,16 @@
 """The daemon's list of alarms: latched until they are over and acknowledged, kept over its end."""
 
+import errno
 import json
 import math
 import os
+import resource
+import threading
+from types import SimpleNamespace
 
 import pytest
 
+from sioms.daemon.alarm_keeper import AlarmKeeper
 from sioms.daemon.alarms import MOST, AlarmFile, AlarmList
 
 
@@ -143,3 +148,117 @@ def test_what_a_client_watches_outlives_the_driver(alarms):
     alarms.take("m.x", "m", "force", 1, "force 3 N", 1.0)
     alarms.lose("m", "it died", 2.0)
     assert [(alarm.what, alarm.severity) for alarm in alarms] == [("drift", 1), ("force", 3)]
+
+
+def test_an_empty_file_is_a_list_that_is_lost(tmp_path):
+    path = tmp_path / "stops.alarms"
+    path.touch()
+    assert "Expecting value" in restored(path)[1]
+
+
+@pytest.mark.parametrize("fault", ["limit", "EIO", "ENOSPC", "EDQUOT", "EROFS"])
+def test_what_cannot_be_kept_leaves_what_was_kept_before(tmp_path, monkeypatch, fault):
+    path = tmp_path / "stops.alarms"
+    file = AlarmFile(str(path))
+    file.keep([GOOD])
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    with monkeypatch.context() as patch, pytest.raises(OSError):
+        if fault == "limit":
+            resource.setrlimit(resource.RLIMIT_FSIZE, (100, hard))
+        else:
+            error = OSError(getattr(errno, fault), "no")
+            patch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(error))
+        try:
+            file.keep([{**GOOD, "times": n} for n in range(50)])
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert [each.name for each in tmp_path.iterdir()] == ["stops.alarms"]
+    assert file.load() == [GOOD]
+
+
+def test_all_that_is_kept_is_on_the_disk(tmp_path, monkeypatch):
+    synced = []
+    fsync = os.fsync
+    monkeypatch.setattr(os, "fsync", lambda fd: (synced.append(os.readlink(f"/proc/self/fd/{fd}")), fsync(fd))[1])
+    file = AlarmFile(str(tmp_path / "stops.alarms"))
+    file.keep([GOOD])
+    file.keep([])
+    assert synced == [str(tmp_path / "stops.alarms.new"), str(tmp_path), str(tmp_path)]
+
+
+class Timers:
+    """The loop of a daemon, whose timers run when a test says so."""
+
+    def __init__(self):
+        self.due = []
+
+    def after(self, _delay_s, callback):
+        self.due.append(callback)
+
+    def run(self):
+        due, self.due = self.due, []
+        for callback in due:
+            callback()
+
+
+def keeper_of(path):
+    """Return what keeps the alarms of a daemon, its loop, and what it logs."""
+    said, loop = [], Timers()
+    server = SimpleNamespace(loop=loop, log=lambda *text, **fields: said.append((*text, fields.get("why"))))
+    return AlarmKeeper(server, str(path)), loop, said
+
+
+def test_a_disk_that_hangs_holds_up_no_daemon_and_the_newest_is_kept(tmp_path, monkeypatch):
+    keeper, loop, _ = keeper_of(tmp_path / "stops.alarms")
+    hangs, goes_on = threading.Event(), threading.Event()
+    fsync = os.fsync
+
+    def slow(fd):
+        hangs.set()
+        assert goes_on.wait(60.0)
+        fsync(fd)
+
+    monkeypatch.setattr(os, "fsync", slow)
+    keeper.take("m.x", "m", "force", 1, "first")
+    loop.run()
+    assert hangs.wait(60.0)
+    for n in range(3):  # the loop goes on
+        keeper.take("m.x", "m", "force", 2, f"later {n}")
+        loop.run()
+    assert len(loop.due) == 1 and not (tmp_path / "stops.alarms").exists()
+    goes_on.set()
+    keeper._writer.join()
+    loop.run()
+    keeper.close()
+    assert [entry["text"] for entry in AlarmFile(str(tmp_path / "stops.alarms")).load()] == ["later 2"]
+    loop.run()
+    assert not loop.due, "it rests when all is kept"
+
+
+def test_what_changes_last_is_kept_at_the_end_and_a_failure_is_told(tmp_path):
+    keeper, loop, said = keeper_of(tmp_path / "stops.alarms")
+    keeper.take("m.x", "m", "force", 1, "first")
+    keeper.close()
+    assert len(AlarmFile(str(tmp_path / "stops.alarms")).load()) == 1
+    os.unlink(tmp_path / "stops.alarms")
+    (tmp_path / "stops.alarms").mkdir()
+    keeper.take("m.y", "m", "force", 1, "second")
+    loop.run()
+    keeper._writer.join()
+    loop.run()
+    assert ("error", "not kept", "it is not a regular file") in said
+
+
+@pytest.mark.parametrize("at_all", [False, True])
+def test_without_a_thread_alarms_are_kept_all_the_same(tmp_path, monkeypatch, at_all):
+    keeper, loop, _ = keeper_of(tmp_path / "stops.alarms")
+
+    def none(_):
+        raise RuntimeError("can't start new thread")
+
+    if at_all:
+        monkeypatch.setattr(threading.Thread, "start", none)
+    keeper.take("m.x", "m", "force", 1, "first")
+    loop.run()
+    keeper.close()
+    assert len(AlarmFile(str(tmp_path / "stops.alarms")).load()) == 1

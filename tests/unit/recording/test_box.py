@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import resource
 from pathlib import Path
 
 import numpy as np
@@ -67,6 +68,28 @@ def test_it_is_written_after_its_cause(tmp_path: Path, why: str) -> None:
     box.look()
     box.close()
     assert [path.name.split("-")[1] for path in tmp_path.iterdir()] == [f"{why}.mcap"]
+
+
+@pytest.mark.parametrize("fault", ["full while live", "full while packed", "a folder"])
+def test_a_box_that_cannot_be_written_is_told_and_leaves_nothing(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], fault: str
+) -> None:
+    box = filled(tmp_path, 3)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    if fault == "a folder":
+        box._folder = tmp_path / "gone"
+    limit = {"full while live": 10_000, "full while packed": 150_000}.get(fault, soft)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        box.ask("request")
+        box.close()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    told = capfd.readouterr().err
+    if fault == "full while packed" and not told:
+        pytest.fail("it was written: choose another limit")
+    assert "sioms blackbox: write " in told and "it is lost" in told
+    assert list(tmp_path.iterdir()) == []
 
 
 def at(ms: float, source: str, kind: str, text: str, **data: object) -> Event:

@@ -95,6 +95,34 @@ def test_a_full_disk_leaves_whole_records(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(data) == size + 19 and data.endswith(b"there is room again")
 
 
+@pytest.mark.parametrize("why", ["there already", "no space left", "too many open"])
+def test_a_next_file_that_cannot_be_made_leaves_the_present_one_whole(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, why: str
+) -> None:
+    """And no descriptor is closed twice: its number may be another's by then."""
+    file = LiveFile(str(tmp_path / "a.mcap"), most_bytes=100, pack=False)
+    file.append(b"\x0c" + (200).to_bytes(8, "little") + bytes(200))
+    with monkeypatch.context() as patch, pytest.raises(OSError, match=f"record to .*a-0002.mcap: .*{why}"):
+        if why == "there already":
+            (tmp_path / "a-0002.mcap").write_text("mine")
+        else:
+            error = errno.ENOSPC if why == "no space left" else errno.EMFILE
+
+            def fail(*_: Any) -> int:
+                raise OSError(error, os.strerror(error))
+
+            patch.setattr(os, "write" if error == errno.ENOSPC else "open", fail)
+        file.look()
+    assert file.path == str(tmp_path / "a-0001.mcap")
+    file.append(b"still the first")
+    other = os.open(tmp_path, os.O_RDONLY)
+    file.close()
+    os.close(other)
+    assert (tmp_path / "a-0001.mcap").read_bytes().endswith(b"still the first")
+    left = [path.name for path in tmp_path.iterdir() if path.name != "a-0001.mcap"]
+    assert left == (["a-0002.mcap"] if why == "there already" else [])
+
+
 def test_files_rotate_and_each_stands_for_itself(tmp_path: Path) -> None:
     file = LiveFile(str(tmp_path / "a.mcap"), most_bytes=1000, pack=False)
     from sioms.recording import mcap

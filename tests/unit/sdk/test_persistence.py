@@ -1,5 +1,6 @@
 """Positions over a restart: files, what of them is believed, and that no interruption leaves a wrong entry."""
 
+import errno
 import math
 import os
 import resource
@@ -199,16 +200,17 @@ class Killed(Exception):
     """The process ends here."""
 
 
-class Column(np.ndarray):
-    """A column of a file; its process is killed before one of its stores, when ``left`` is used up."""
+class Dying(PositionFile):
+    """A file whose process is killed within one of its writes, when ``left`` is used up: the beginning is written."""
 
-    left = 0
+    left, cut = 1 << 30, 0
 
-    def __setitem__(self, rows, values):
-        if not Column.left:
+    def _put(self, first, end):
+        if not self.left:
+            super()._put(first, min(end, first + self.cut))
             raise Killed
-        Column.left -= 1
-        super().__setitem__(rows, values)
+        self.left -= 1
+        super()._put(first, end)
 
 
 @settings(max_examples=100)
@@ -216,9 +218,8 @@ class Column(np.ndarray):
 def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, history, data):
     """What is marked at rest is, whole, the place noted last or, before that note is done, the one before it."""
     path = tmp_path_factory.mktemp("kept") / "x"
-    file = PositionFile(str(path), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
-    file._state, file._raw, file._position = (c.view(Column) for c in (file._state, file._raw, file._position))
-    Column.left = data.draw(st.integers(0, 4 * len(history)))
+    file = Dying(str(path), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
+    file.left, file.cut = data.draw(st.integers(0, 4 * len(history))), data.draw(st.integers(0, 1)) * 8
     noted = [(False, 0.0, 0.0)]
     complete = False
     try:
@@ -266,6 +267,78 @@ def test_where_the_disk_is_full_no_place_of_an_earlier_run_is_left_to_be_believe
     assert kept == [] and block.bank.keeper is None
     assert [level for level, _ in said] == ["error"] and "positions are not kept" in said[0][1]
     assert list(tmp_path.iterdir()) == []
+
+
+def failing(error):
+    """Return what stands in for a function of os whose disk is broken."""
+
+    def fail(*_):
+        raise OSError(error, os.strerror(error))
+
+    return fail
+
+
+@pytest.mark.parametrize("fault", ["EIO", "ENOSPC", "EDQUOT", "short"])
+@pytest.mark.parametrize("successor", [False, True])
+def test_a_mark_that_cannot_be_taken_away_is_not_believed_and_the_axis_moves(tmp_path, monkeypatch, fault, successor):
+    cell = moved_to(tmp_path / "x", 0.75, ALWAYS)
+    if successor:
+        Kept(tmp_path / "x", axis(restore=ALWAYS)).rig.tick(102)
+    broken = failing(getattr(errno, fault, 0)) if fault != "short" else lambda *_: 0
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", broken)
+        cell.rig.write(mode=MODE.POSITION, position=2.0)
+        cell.rig.run()
+    assert cell.rig.field("position") == pytest.approx(2.0)
+    told = [said for said in cell.said if "not kept" in said]
+    assert len(told) == 1 and str(tmp_path / "x") in told[0]
+    cell.file.close()
+    assert (tmp_path / "x").exists() == successor
+    after = Kept(tmp_path / "x", axis(restore=ALWAYS))
+    assert after.rig.field("position") == pytest.approx(0.75 if successor else 0.0)
+
+
+def test_where_the_file_cannot_be_removed_either_it_says_nothing_that_could_be_believed(tmp_path, monkeypatch):
+    cell = moved_to(tmp_path / "x", 0.75, ALWAYS)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "pwrite", failing(errno.EIO))
+        patch.setattr(os, "unlink", failing(errno.EROFS))
+        cell.rig.write(mode=MODE.POSITION, position=2.0)
+        cell.rig.run()
+    assert any("remove it before the next start" in said for said in cell.said)
+    assert Kept(tmp_path / "x", axis(restore=ALWAYS)).rig.field("position") == 0.0
+
+
+def test_an_end_that_does_not_reach_the_disk_is_no_orderly_one(tmp_path, monkeypatch):
+    cell = moved_to(tmp_path / "x", 0.75, ALWAYS)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", failing(errno.EIO))
+        cell.file.close()
+    assert "not kept" in cell.said[-1]
+    assert Kept(tmp_path / "x", axis(restore=ALWAYS), boot="other").rig.field("position") == 0.0
+
+
+def test_a_file_that_somebody_truncates_ends_no_driver_and_is_not_believed(tmp_path):
+    """Mapped into memory, the next store would be SIGBUS."""
+    cell = moved_to(tmp_path / "x", 0.75, ALWAYS)
+    os.truncate(tmp_path / "x", 0)
+    cell.rig.write(mode=MODE.POSITION, position=2.0)
+    cell.rig.run()
+    cell.rig.tick(102)
+    cell.file.close()
+    assert cell.rig.field("position") == pytest.approx(2.0)
+    after = Kept(tmp_path / "x", axis(restore=ALWAYS))
+    assert after.rig.field("position") == 0.0 and any("not a position file" in said for said in after.said)
+
+
+@pytest.mark.parametrize("left", ["file", "link", "pipe"])
+def test_what_a_killed_process_left_beside_the_file_is_not_written_to(tmp_path, left):
+    other, fresh = tmp_path / "other", tmp_path / "x.new"
+    other.write_text("mine")
+    {"file": fresh.touch, "link": lambda: fresh.symlink_to(other), "pipe": lambda: os.mkfifo(fresh)}[left]()
+    moved_to(tmp_path / "x", 0.75, ALWAYS)
+    assert other.read_text() == "mine" and not fresh.exists()
+    assert Kept(tmp_path / "x", axis(restore=ALWAYS)).rig.field("position") == pytest.approx(0.75)
 
 
 def test_offsets_are_those_of_the_rule():
