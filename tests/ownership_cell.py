@@ -47,6 +47,7 @@ from ownership_model import (
     DEAD,
     DEVICES,
     ENDING,
+    FAULT,
     IN,
     OPEN,
     ORPHAN,
@@ -70,6 +71,7 @@ from sioms import command
 from sioms.daemon.devices import DriverProcess
 from sioms.daemon.log import Log
 from sioms.daemon.loop import Loop
+from sioms.daemon.restarts import LIMIT
 from sioms.daemon.rights import Peer
 from sioms.daemon.server import Server
 from sioms.daemon.stop_record import StopRecord
@@ -384,6 +386,14 @@ class Cell:
         for pidfd in list(device._dying):
             _serve(self._watched, pidfd)
 
+    def fail(self, d: int) -> None:
+        device = self._device(d)
+        device.restarts.deaths_ns[:] = [CLOCK()] * (LIMIT - 1)
+        assert device._sock is not None
+        _serve(self._watched, device._pidfd)
+        for pidfd in list(device._dying):
+            _serve(self._watched, pidfd)
+
     def start(self, d: int) -> None:
         timer = self._device(d)._timer
         assert timer is not None and timer.callback is not None
@@ -458,7 +468,7 @@ class Cell:
 
     def _view_device(self, d: int, model: State) -> Any:
         expected, device = model.devices[d], self._device(d)
-        phase = {"starting": STARTING, "up": UP, "ending": ENDING, "restarting": PAUSING}.get(
+        phase = {"starting": STARTING, "up": UP, "ending": ENDING, "restarting": PAUSING, "fault": FAULT}.get(
             device.state.value, ABSENT
         )
         claim: Any = ()

@@ -15,6 +15,7 @@ from typing import NamedTuple
 from ownership_cell import Cell, cells
 from ownership_model import (
     CLIENTS,
+    FAULT,
     GUEST,
     IN,
     OPEN,
@@ -52,7 +53,10 @@ def check_rest(s: State) -> None:
         Broken: something is.
     """
     for d, device in enumerate(s.devices):
-        promise(device.phase == UP, "a device comes back")
+        promise(device.phase in (UP, FAULT), "a device comes back")
+        promise(device.phase == UP or not (device.claim or device.driver), "nothing is left of a device in fault")
+        if device.phase == FAULT:
+            continue
         (driver,) = device.driver
         promise(not device.claim or device.claim[1] == OPEN, "nothing is left of a handle that ends")
         promise(not device.claim or s.clients[device.claim[0]][0] == IN, "nothing is left of the dead")
@@ -317,7 +321,7 @@ DEVICE_SECOND = frozenset(
         "expire",
     ]
 )
-DEVICE_FIRST = frozenset(["hear", "tick", "see_death", "kill", "leave", "listen", "bury", "start", "replace"])
+DEVICE_FIRST = frozenset(["hear", "tick", "see_death", "kill", "leave", "listen", "bury", "fail", "start", "replace"])
 
 
 def _named(action: Action, clients: tuple[int, ...], devices: tuple[int, ...]) -> Action:

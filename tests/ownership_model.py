@@ -25,8 +25,8 @@ OUT, IN, DEAD = "out", "in", "dead"
 """A client: without a session; with one; dead, and the daemon has not noticed."""
 LAST_WORDS = ("", "open 0", "open 1", "stop")
 """What a dying client has sent, and the daemon has not read."""
-ABSENT, STARTING, UP, ENDING, PAUSING = "absent", "starting", "up", "ending", "pausing"
-"""A device, as the daemon sees it."""
+ABSENT, STARTING, UP, ENDING, PAUSING, FAULT = "absent", "starting", "up", "ending", "pausing", "fault"
+"""A device, as the daemon sees it; FAULT: its driver has died too often, and waits for a reset."""
 OPEN, CLOSING, TOLD, ORPHAN = "open", "closing", "told", "orphan"
 """A handle, as the daemon sees it: its client closes it; its driver was told to end it; its session has ended."""
 ATTACH, DETACH, END, STOP, RESET, VOID = "attach", "detach", "end", "stop", "reset", "void"
@@ -209,6 +209,8 @@ class Step:
             if self._driver(d) is not None:
                 inbox = [(VOID if v in (STOP, RESET) else v, n, m) for v, n, m in self.devices[d].driver[0].inbox]
                 self._drive(d, missed=True, asked=False, inbox=tuple(inbox))
+            elif self.devices[d].phase == FAULT:
+                self.start(d)
 
     def _hear_request(self) -> int:
         request, self.request = self.request, 0
@@ -223,6 +225,10 @@ class Step:
 
     def reset_node(self, c: int, d: int) -> None:
         there = self.devices[d].phase in (STARTING, UP, ENDING)
+        if self._may_write(c) and self.devices[d].phase == FAULT:
+            self.answer = "done"  # another try, for the device; what is stopped stays so
+            self.start(d)
+            return
         if not self._may_write(c) or self.stopped or (there and not self._send(d, RESET)):
             self.answer = "refused"
             return
@@ -414,6 +420,11 @@ class Step:
         if again:
             self.start(d)
 
+    def fail(self, d: int) -> None:
+        """See that a driver has died too often."""
+        self.bury(d, "process")
+        self._set(d, phase=FAULT)
+
     def start(self, d: int) -> None:
         self._set(
             d, phase=STARTING, driver=(Driver(outbox=(READY,), node_stop=self.node_stops[d], stopped=self.stopped),)
@@ -424,7 +435,7 @@ class Step:
 
     def replace(self, d: int) -> None:
         """Take up a configuration in which a device has changed."""
-        if self.devices[d].phase == PAUSING:
+        if self.devices[d].phase in (PAUSING, FAULT):
             self.start(d)
         elif self.devices[d].phase in (STARTING, UP):
             self._send(d, END)
@@ -549,6 +560,8 @@ def _of_driver(s: State, d: int, device: Device) -> Iterator[Action]:
         if not driver.alive:
             yield ("bury", d, "socket")
             yield ("bury", d, "process")
+            if device.phase in (STARTING, UP):
+                yield ("fail", d)
             continue
         yield ("kill", d)
         heeds = driver.missed or driver.asked or driver.stopped != s.stopped
@@ -565,7 +578,7 @@ def _of_driver(s: State, d: int, device: Device) -> Iterator[Action]:
             yield ("leave", d)
     if device.phase == PAUSING:
         yield ("start", d)
-    if s.daemon and device.phase in (STARTING, UP, PAUSING):
+    if s.daemon and device.phase in (STARTING, UP, PAUSING, FAULT):
         yield ("replace", d)
 
 

@@ -175,22 +175,29 @@ class Group:
         """Have the loop of a device go on; return the descriptors that are ready."""
         quiet, member.quiet = member.quiet, None
         self._of[fd] = 0
-        return [] if quiet is None else member.runtime.take_back(quiet)
+        ready: list[int] = []
+        if quiet is not None:
+            self._guarded(member, lambda: ready.extend(member.runtime.take_back(quiet)))
+        return ready
 
     def _go_on(self, fd: int, member: Member) -> None:
         """Let a device tick by steps, or leave."""
+        self._guarded(member, lambda: self._lend(fd, member))
         if not member.runtime.running:
             del self._members[fd]
             self._epoll.unregister(fd)
             member.runtime.release()
             _close(member.fds)
-            return
+
+    def _lend(self, fd: int, member: Member) -> None:
         member.quiet = member.runtime.lend()
         if member.quiet is not None:
             self._of[fd] = member.quiet.record.address
 
     def _guarded(self, member: Member, work: Callable[[], object]) -> None:
-        """Do the work of one device; what it raises ends this one."""
+        """Do the work of one device that has not ended; what it raises ends this one."""
+        if not member.runtime.running:
+            return
         try:
             work()
         except Exception as error:  # stop first, report second; the others go on

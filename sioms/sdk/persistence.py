@@ -236,8 +236,7 @@ class PositionFile:
         with suppress(OSError):
             if os.path.samestat(os.fstat(self._fd), os.stat(self._path)):  # and not a successor's
                 _forget(self._path, self._log)
-        os.close(self._fd)
-        self._fd = -1
+        self.let_go()
 
     def close(self) -> None:
         """Say that the process ended in order, and wait until that is on the disk."""
@@ -250,9 +249,13 @@ class PositionFile:
             os.fsync(self._fd)
         except OSError as error:
             self._give_up(error)
-            return
-        os.close(self._fd)
-        self._fd = -1
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Write nothing from now on; without ``close`` before it, that is no orderly end."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
 
 
 def _at_once(path: str, flags: int) -> int:

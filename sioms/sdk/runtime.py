@@ -297,6 +297,10 @@ class Runtime:
     def release(self) -> None:
         """Close what is open, when the process goes on with other devices; the daemon hears of it last."""
         self.clients.end_all(errno.EIO, "its driver has ended")
+        for held in self.held.values():
+            held.detach()
+        for kept in self._kept:
+            kept.let_go()
         for timer in (self._timer, self._line_timer):
             timer.close()
         self._epoll.close()

@@ -255,6 +255,33 @@ def test_a_lease_runs_from_what_the_client_had_been_told_so_a_late_burst_renews_
     assert node.got == [b"write 1"], "nothing resumes"
 
 
+def test_what_comes_late_renews_a_lease_from_when_its_client_was_told_the_time(world: World) -> None:
+    world.begin(b"a")
+    node = world.open(b"a", 5)
+    lease_ns, told_ns = int(link.DEFAULT_LEASE_S * 1e9), world.told(b"a")
+    world.now_ns = told_ns + lease_ns - 1  # within the lease, and all but late
+    world.frame(b"a", Up.PACKET, 5, b"write 1", stamp_ns=told_ns)
+    world.gateway.tick()
+    assert node.state == "open"
+    world.now_ns = told_ns + lease_ns + 1
+    world.gateway.tick()
+    assert node.got == [b"write 1"] and node.state == "ended"
+
+
+@pytest.mark.parametrize("late_s", [0.0, 0.4, 0.999, 1.0, 7.0])
+def test_a_word_of_a_supervisor_holds_from_when_its_client_was_told_the_time(world: World, late_s: float) -> None:
+    line = world.begin(b"a")
+    told_ns, count = world.told(b"a"), len(line.got)
+    world.now_ns = told_ns + int(late_s * 1e9)
+    world.frame(b"a", Up.PACKET, 0, verbs.Supervise(1.0).packed(9), stamp_ns=told_ns)
+    if late_s < 1.0:
+        (packet,) = line.got[count:]
+        _, message = verbs.take(packet, verbs.FROM_CLIENT)
+        assert isinstance(message, verbs.Supervise) and message.lease_s == pytest.approx(1.0 - late_s)
+    else:
+        assert line.got[count:] == [] and "late" in decode_reply(world.last(b"a", Down.PACKET)[1])[3]
+
+
 def test_a_session_that_owns_something_is_told_the_time_often_enough_to_renew(world: World) -> None:
     world.begin(b"a")
     world.open(b"a", 5)

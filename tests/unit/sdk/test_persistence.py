@@ -380,3 +380,16 @@ def test_a_place_that_is_no_number_is_not_restored(bad):
     for entry in (Entry(AT_REST, bad, 0.1), Entry(AT_REST, 0.1, bad)):
         offset, why = offset_of(entry, rule, 0.1)
         assert offset is None and why
+
+
+def test_a_device_that_ends_alone_leaves_no_descriptor_and_no_orderly_end(tmp_path):
+    """Its process may go on with other devices."""
+    cell = moved_to(tmp_path / "x", 0.75, ALWAYS)
+    before = len(os.listdir("/proc/self/fd"))
+    cell.file.let_go()
+    assert len(os.listdir("/proc/self/fd")) == before - 1
+    cell.rig.write(mode=MODE.POSITION, position=2.0)
+    cell.rig.run()
+    cell.file.close()
+    held = decode((tmp_path / "x").read_bytes())
+    assert not held.closed and held.entries["x"].position == pytest.approx(0.75)

@@ -1,0 +1,105 @@
+"""Several devices in one process: what one of them raises, wherever, ends that one, and the others tick on."""
+
+import os
+import select
+import socket
+from types import SimpleNamespace
+
+import pytest
+
+from sioms.sdk.group import Group, Member
+
+
+class Runtime:
+    """A device's part of the process that raises where a test says so."""
+
+    def __init__(self, fails_in=""):
+        self.poll_fd, self._fails_in = os.eventfd(1, os.EFD_NONBLOCK), fails_in
+        self.running, self.pause_s, self.did = True, None, []
+        self.record = SimpleNamespace(address=0)
+
+    def _do(self, what):
+        self.did.append(what)
+        if what == self._fails_in:
+            raise ZeroDivisionError(what)
+
+    def start(self):
+        self._do("start")
+
+    def lend(self):
+        self._do("lend")
+        return self
+
+    def take_back(self, quiet):
+        self._do("take back")
+        return [7]
+
+    def ready_but(self, known):
+        return []
+
+    def serve(self, ready):
+        self._do("serve")
+
+    def heed_requests(self):
+        self._do("heed requests")
+
+    def fail(self, error):
+        self.did.append(f"stopped: {error}")
+
+    def release(self):
+        self.did.append("released")
+        os.close(self.poll_fd)
+
+
+@pytest.fixture
+def group(monkeypatch):
+    monkeypatch.setattr(Group, "_settle", lambda self, member: None)
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        yield Group(ours)
+
+
+def start(group, *fails_in):
+    members = [Member(Runtime(each), [], 0, "") for each in fails_in]
+    for member in members:
+        group._start(member)
+    return members
+
+
+@pytest.mark.parametrize("where", ["start", "lend", "take back", "serve", "heed requests"])
+def test_what_a_device_raises_ends_it_alone(group, where):
+    bad, good = start(group, where, "")
+    for member in (bad, good):
+        if member.runtime.running:
+            group._serve(member.runtime.poll_fd, member)
+    group._heed_requests()
+    assert bad.runtime.did[-2:] == [f"stopped: {where}", "released"], "stopped first, and once"
+    assert bad.runtime.did.count("released") == 1 and not bad.runtime.running
+    assert good.runtime.did == [
+        "start",
+        "lend",
+        "take back",
+        "serve",
+        "lend",
+        "take back",
+        "heed requests",
+        "serve",
+        "lend",
+    ]
+    assert list(group._members.values()) == [good]
+
+
+def test_one_that_has_ended_is_waited_for_no_more(group):
+    (member,) = start(group, "")
+    assert group._wait() == [member.runtime.poll_fd]
+    member.runtime.running = False
+    group._serve(member.runtime.poll_fd, member)
+    assert member.runtime.did[-1] == "released"
+    assert not group._members and not select.select([group._epoll.fileno()], [], [], 0)[0]
+
+
+def test_what_has_more_to_do_is_served_without_an_event(group):
+    (member,) = start(group, "")
+    os.eventfd_read(member.runtime.poll_fd)
+    member.runtime.pause_s = 0.0
+    assert group._wait() == [member.runtime.poll_fd]

@@ -1,0 +1,270 @@
+"""Compiled ticks leave to the loop whatever is more than a tick; run as Python where nothing is compiled."""
+
+import ctypes
+import os
+import select
+import time
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sioms.native.language import library
+from sioms.sdk import quiet_step
+from sioms.sdk.quiet import QuietRun
+from sioms.sdk.quiet_step import (
+    DAEMON_ALIVE,
+    DONE,
+    FIRST,
+    HEARD,
+    LEFT,
+    ORDERS,
+    RESETS,
+    RESTED,
+    RING,
+    SLOT,
+    STIRS,
+    STOPPED,
+    Many,
+    Page,
+    Quiet,
+    heed,
+    heed_one,
+    one_tick,
+    publish,
+    run,
+    run_many,
+)
+from sioms.sdk.rt import TimerFd
+
+PERIOD_NS, LEASE_NS = 1_000_000, 60_000_000_000
+STEP = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
+
+
+class Function:
+    """A function of Python that compiled steps can call."""
+
+    def __init__(self, function):
+        self.compiled = STEP(function)
+
+
+class Device:
+    """A driver whose steps write down that they were called, and its process between two events."""
+
+    def __init__(self, lead_ns=0, **fields):
+        self.ticks, self.slacks, self.answer, self.slackens, self.rests = [], 0, 0, 0, 0
+        self.timer, self.other = os.eventfd(0, os.EFD_NONBLOCK), os.eventfd(0, os.EFD_NONBLOCK)
+        self.line = TimerFd()
+        self.poll = select.epoll()
+        for fd in (self.timer, self.other, self.line.fd):
+            self.poll.register(fd, select.EPOLLIN)
+        self.latch = np.zeros(8, dtype=np.int64)
+        self.latch[DAEMON_ALIVE] = time.monotonic_ns()
+        self.ready, self.ring = np.zeros(64, dtype=np.int64), np.zeros(7 * RING, dtype=np.int64)
+        given = {
+            "poll": self.poll.fileno(), "timer": self.timer, "line_timer": self.line.fd, "ready": self.ready,
+            "latch": self.latch, "stopped": 0, "resets": 0, "orders": 0, "daemon_lease_ns": LEASE_NS,
+            "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns, "announced": 0,
+            "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
+            "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
+            "done": 0, "expired": 1, "slackens": 0, "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
+        }  # fmt: skip
+        for name, function in (("tick", self._tick), ("slack", self._slack), ("rest", self._rest)):
+            given[name] = function if library is None else Function(function)
+        self.quiet = Quiet(**{**given, **fields})
+
+    def _tick(self, _device, scheduled_ns, _began_ns, number):
+        self.ticks.append((scheduled_ns, number))
+        return self.answer
+
+    def _slack(self, _device, _now_ns, _due_ns, _):
+        self.slacks += 1
+        return self.slackens
+
+    def _rest(self, *_):
+        return self.rests
+
+    def close(self):
+        for fd in (self.timer, self.other):
+            os.close(fd)
+        self.line.close()
+        self.poll.close()
+
+
+@pytest.fixture
+def make():
+    made = []
+
+    def of(**fields):
+        made.append(Device(**fields))
+        return made[-1]
+
+    yield of
+    for device in made:
+        device.close()
+
+
+@pytest.mark.parametrize("word", [STOPPED, RESETS, ORDERS])
+def test_what_is_said_in_the_latch_is_the_loops(make, word):
+    device = make()
+    device.latch[word] += 1
+    assert one_tick(device.quiet) == LEFT
+    assert not device.ticks and device.quiet.expired == 1 and device.quiet.number == 7, "the tick is the loop's, too"
+
+
+@pytest.mark.parametrize("what", ["the daemon is silent", "a lease ends", "the driver has something to tell"])
+def test_what_ends_or_is_told_is_the_loops(make, what):
+    device = make()
+    match what:
+        case "the daemon is silent":
+            device.latch[DAEMON_ALIVE] -= LEASE_NS
+        case "a lease ends":
+            device.quiet.until_ns = time.monotonic_ns() - 1
+        case _:
+            device.answer = 1
+    assert one_tick(device.quiet) == LEFT
+    assert bool(device.ticks) == (device.answer == 1)
+    assert device.quiet.expired == 1 and device.quiet.number == 7 and device.quiet.done == 0
+
+
+def test_a_tick_is_counted_with_those_that_were_missed(make):
+    device = make(expired=3, scheduled_ns=500)
+    assert one_tick(device.quiet) == DONE
+    assert device.ticks == [(500 + 3 * PERIOD_NS, 8)]
+    quiet = device.quiet
+    assert (quiet.number, quiet.done, quiet.skipped, quiet.expired) == (8, 1, 2, 0)
+    assert (quiet.ticks, device.slacks) == (1, 1) and quiet.longest_ns > 0
+
+
+def test_an_idle_device_misses_as_many_as_it_leaves_out(make):
+    device = make(expired=2, periods=40)
+    assert one_tick(device.quiet) == DONE
+    assert device.ticks == [(80 * PERIOD_NS, 8)] and device.quiet.skipped == 40
+
+
+@pytest.mark.parametrize("watched", [0, 1])
+@pytest.mark.parametrize("slackens", [0, 1])
+def test_whom_nobody_looks_at_comes_to_rest(make, watched, slackens):
+    device = make(watched=watched, rest_ns=1_000)
+    device.rests, device.slackens = 1, slackens
+    found = one_tick(device.quiet)
+    rests = not watched and not slackens
+    assert device.quiet.told == (RESTED if rests else 0)
+    assert found == (HEARD if rests or slackens else DONE)
+
+
+@pytest.mark.parametrize("periods", [1, 40])
+def test_what_moves_again_is_idle_no_more(make, periods):
+    device = make(watched=0, periods=periods, rest_ns=1)
+    assert one_tick(device.quiet) == (HEARD if periods > 1 else DONE)
+    assert device.quiet.told == (STIRS if periods > 1 else 0) and device.quiet.restless_ns > 0
+
+
+def test_ticks_go_on_until_something_else_is_ready(make):
+    device = make(expired=0)
+    device.answer = 0
+    os.eventfd_write(device.timer, 2)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
+    os.eventfd_write(device.timer, 1)
+    os.eventfd_write(device.other, 1)
+    assert run(device.quiet) == 2, "both are the loop's"
+    assert set(device.ready[:2].tolist()) == {device.timer, device.other}
+    assert len(device.ticks) == 1 and os.eventfd_read(device.timer) == 1
+
+
+def test_a_slack_before_the_tick_announces_it(make):
+    device = make(lead_ns=200_000, expired=0, scheduled_ns=time.monotonic_ns() - 3 * PERIOD_NS)
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
+    assert (device.slacks, device.ticks, device.quiet.announced) == (1, [], 1)
+    select.select([device.line.fd], [], [], 10.0)
+    device.ready[0] = device.line.fd
+    assert heed(device.quiet, 1) == DONE
+    assert len(device.ticks) == 1 and device.quiet.announced == 0 and device.slacks == 1
+
+
+def test_of_many_devices_only_those_with_more_to_do_are_the_loops(make):
+    devices = [make(expired=0) for _ in range(3)]
+    devices[1].answer = 1
+    with select.epoll() as poll:
+        of = np.zeros(1024, dtype=np.int64)
+        for device in devices:
+            poll.register(device.poll.fileno(), select.EPOLLIN)
+            os.eventfd_write(device.timer, 1)
+        for device in devices[:2]:  # the loop has the third
+            of[device.poll.fileno()] = device.quiet.address
+        ready = np.zeros(64, dtype=np.int64)
+        many = Many(poll=poll.fileno(), ready=ready, timeout_ms=0, of=of, size=len(of), heed=heed_one)
+        count = run_many(many)
+        assert set(ready[:count].tolist()) == {device.poll.fileno() for device in devices[1:]}
+    assert [len(device.ticks) for device in devices] == [1, 1, 0]
+
+
+def page(pipes=(), every=()):
+    """Return a page of four slots of two words, and its memory."""
+    words, slot = np.zeros(FIRST + 4 * (SLOT + 2), dtype=np.int64), SLOT + 2
+    count = np.array([every[i] for i in range(len(every))], dtype=np.int64)
+    made = Page(
+        words=words, payload=np.array([5, 6], dtype=np.int64), count=2, slot=slot, mask=3, number=9,
+        subscribers=len(pipes), pipes=np.array(pipes, dtype=np.int64), every=count, countdown=count.copy(),
+    )  # fmt: skip
+    return made, words
+
+
+def test_a_snapshot_is_published_in_its_slot():
+    made, words = page()
+    publish(made, 100, 3, 90)
+    at = FIRST + (10 & 3) * (SLOT + 2)
+    assert words[at : at + 6].tolist() == [10, 100, 3, 90, 5, 6]
+    assert words[quiet_step.HEAD] == 10 == made.number
+    assert np.count_nonzero(np.delete(words, [quiet_step.HEAD, *range(at, at + 6)])) == 0
+
+
+def test_who_subscribed_is_woken_every_so_many_publications():
+    pipes = [os.pipe2(os.O_NONBLOCK) for _ in range(3)]
+    try:
+        made, _ = page([w for _, w in pipes], [1, 3, 0])
+        woken = []
+        for number in range(7):
+            publish(made, number, number, number)
+            for i, (r, _) in enumerate(pipes):
+                if select.select([r], [], [], 0)[0]:
+                    woken.append((number, i))
+                    os.read(r, 8)
+        assert woken == sorted([*((n, 0) for n in range(7)), (2, 1), (5, 1)])
+    finally:
+        for pair in pipes:
+            for fd in pair:
+                os.close(fd)
+
+
+@pytest.mark.parametrize(("waits_ns", "clients_ns", "until_ns"), [(500, 900, 500), (900, 500, 500), (2**62, 7, 7)])
+def test_steps_last_no_longer_than_waits_and_the_leases_of_clients(waits_ns, clients_ns, until_ns):
+    quiet = quiet_run(waits_ns, clients_ns)
+    assert quiet.lend(1_000, 4, True)
+    assert quiet.record.until_ns == until_ns
+    assert (quiet.record.stopped, quiet.record.resets, quiet.record.orders) == (3, 2, 1)
+
+
+@pytest.mark.parametrize("why", ["a wait needs the loop", "the driver is not ready", "its pages cannot be lent"])
+def test_steps_do_not_begin_where_the_loop_has_to_go_on(why):
+    quiet = quiet_run(0 if why.startswith("a wait") else 5, 5, "driver" not in why, "pages" not in why)
+    assert not quiet.lend(1_000, 4, True)
+
+
+def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
+    """Return what ticks by steps for a process whose parts are as told."""
+    record = Device()
+    steps = SimpleNamespace(
+        tick=record.quiet.tick, slack=record.quiet.slack, rest=record.quiet.rest, record=Page.empty(),
+        is_ready=lambda watched: is_ready, resume=lambda: None,
+    )  # fmt: skip
+    statistics = SimpleNamespace(ring=record.ring.reshape(7, RING), ticks=0, longest_ns=0, skipped=0)
+    quiet = QuietRun(
+        steps, record.poll.fileno(), record.timer, record.line.fd, record.latch, PERIOD_NS, 0, LEASE_NS,
+        SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
+        SimpleNamespace(lend=lambda: lends), SimpleNamespace(seen=(3, 2, 1)),
+        SimpleNamespace(until_ns=lambda: waits_ns), SimpleNamespace(until_ns=lambda: clients_ns), statistics,
+    )  # fmt: skip
+    record.close()
+    return quiet
