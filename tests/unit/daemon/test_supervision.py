@@ -57,6 +57,15 @@ def test_the_last_supervisor_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(world.stops) == 1
 
 
+def test_supervisors_that_are_silent_together_are_missed_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World(monkeypatch, 0.5)
+    supervision: Any = world.supervision
+    for name in ("one", "two", "three"):
+        supervision.renew(name, 9.0)
+    world.pass_time(2.0)
+    assert supervision.missing and len(world.stops) == 1 and "was silent" in world.stops[0]
+
+
 def test_a_workcell_that_asks_for_none_needs_none(monkeypatch: pytest.MonkeyPatch) -> None:
     world = World(monkeypatch, 0.0)
     supervision: Any = world.supervision

@@ -70,6 +70,20 @@ def test_it_is_written_after_its_cause(tmp_path: Path, why: str) -> None:
     assert [path.name.split("-")[1] for path in tmp_path.iterdir()] == [f"{why}.mcap"]
 
 
+def test_what_came_last_is_in_the_box(tmp_path: Path) -> None:
+    """And not only the seconds that are packed already."""
+    box = filled(tmp_path, 2)
+    box.append(mcap.metadata("last", {"word": "stop"}))
+    box.ask("request")
+    box.look()
+    box.close()
+    (path,) = tmp_path.iterdir()
+    with Recording(path) as recording:
+        for _ in recording.pieces():
+            pass
+        assert ("last", {"word": "stop"}) in recording.metadata
+
+
 @pytest.mark.parametrize("fault", ["full while live", "full while packed", "a folder"])
 def test_a_box_that_cannot_be_written_is_told_and_leaves_nothing(
     tmp_path: Path, capfd: pytest.CaptureFixture[str], fault: str

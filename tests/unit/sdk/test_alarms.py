@@ -75,6 +75,27 @@ def test_a_reaction_comes_with_each_step_upwards_and_only_then():
     assert [each[:2] for each in w.stopped] == [("STOP_NODE", 0), ("STOP_WORKCELL", 0)]
     w.publish([math.nan])
     assert w.stopped[2][0] == "STOP_DEVICE" and "no valid measurement" in w.stopped[2][2]
+    w.publish([1.5], 1.0)
+    assert [told[2] for told in w.publish([1.5], 2.0)] == [1], "it eases"
+    assert len(w.stopped) == 3
+
+
+def test_each_alarm_eases_by_a_time_of_its_own():
+    w = Watched(block_of(2), rule(0, high=1.0), rule(1, high=1.0))
+    w.publish([2.0, 2.0], 1.0)
+    assert w.publish([0.0, 0.0], 1.05) == []
+    assert w.publish([0.0, 2.0], 1.10) == [], "the second is back, while the first still eases"
+    assert [told[:3] for told in w.publish([0.0, 0.0], 1.20)] == [(0, -1, 0)], "the second has begun to ease anew"
+    assert [told[:3] for told in w.publish([0.0, 0.0], 1.35)] == [(1, -1, 0)]
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_within_the_hysteresis_a_limit_stays_reached(sign):
+    alarms = Alarms(1)
+    alarms.watch([0], -2.0, -1.0, 1.0, 2.0, 0.5)
+    reached = [int(alarms.look(np.array([sign * value]))[0]) for value in (0.9, 1.0, 0.6, 2.1, 1.6, 1.4, 0.4)]
+    inner, outer = (int(A.HIGH), int(A.HIHI)) if sign > 0 else (int(A.LOW), int(A.LOLO))
+    assert reached == [0, inner, inner, inner | outer, inner | outer, inner, 0]
 
 
 def test_what_cannot_be_read_is_invalid():
@@ -116,7 +137,10 @@ def test_what_is_published_is_watched_and_joins_the_drivers_flags():
     assert block.flags.tolist() == [0, int(A.SATURATED), int(A.OVERRUN)], "the driver's own stay his"
 
 
-@given(st.lists(st.floats(-3, 3), min_size=1, max_size=30), st.floats(0, 0.5))
+@given(
+    st.lists(st.integers(-26, 26).map(lambda n: n / 10 + 0.01), min_size=1, max_size=30),
+    st.sampled_from([0.0, 0.3, 0.5]),
+)
 def test_a_limit_is_left_by_more_than_the_hysteresis(values, hysteresis):
     alarms = Alarms(1)
     alarms.watch([0], -2.0, -1.0, 1.0, 2.0, hysteresis)

@@ -32,6 +32,14 @@ BOOT = "b007"
 ALWAYS, MATCHING = Restore("always"), Restore("matching", 1e-3)
 
 
+@pytest.fixture(autouse=True, scope="module")
+def quick_disk():
+    """Do not wait for the disk: what is written is in the kernel."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "fsync", lambda _: None)
+        yield
+
+
 class Kept:
     """A bank with a file, that can be killed and started again."""
 
