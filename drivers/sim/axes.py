@@ -17,9 +17,11 @@ the axes a tick earlier than those of another process.
     name = "beam0"
     boxes = [{ xaxis = [0.10, 0.14] }]
 
-An axis with a ``load_node``, an analog node of one channel (of a ``sim-world``), bears the force there [N or N m]
-beside that of its motor. While that node is not there the device is lost: its axes stop. A world that waits for its
-axes holds the loads it showed last.
+A device with ``carries = "world.left_joints"``, a node of a ``sim-world``, carries a finger there: its first three
+motors are the finger's joints x, y and th, and bear the springs of its mount. An axis with a ``load_node``, an analog
+node of one channel, bears the force there [N or N m] beside that of its motor, for what answers slowly. While such a
+node is not there the device is lost: its axes stop. A world that waits for its axes holds the loads it showed last, and
+its springs pull at nothing.
 
 An axis with a ``model_file`` (as ``sioms reconcile`` writes it) is the twin of the axis that the model was found
 for: mass, friction, encoder and all effects come from the file, stops and switches from ``motor``. The name and a
@@ -31,7 +33,7 @@ from __future__ import annotations
 import errno
 import time
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
@@ -42,6 +44,7 @@ from numpy.typing import NDArray
 
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
 from sioms.plant.binary import Beam, Box, port_values
+from sioms.plant.carried import Carried
 from sioms.plant.effects import Effect, build_effects, parse_effects
 from sioms.plant.foreign import Laws, TwinAxes, twin
 from sioms.plant.motor import MotorBank
@@ -49,7 +52,7 @@ from sioms.plant.motor_step import Motors
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
 from sioms.plant.stepper_step import Steppers
-from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.flags import AnalogStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, QuietSteps, TickDriver
@@ -61,6 +64,7 @@ from .axes_step import SimulatedAxes, advance_axes, rest_axes, tick_axes
 
 # More than this many ticks late, the simulated world stands still instead of catching up.
 _CATCH_UP = 50
+_JOINTS = 3
 # A profile takes some 20 us to plan; few at a time, so that a plan never delays a tick.
 _PLANS, _SLACK_NS = 8, 300_000
 
@@ -112,6 +116,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         axis: the axes.
         beam: light beams that look at them.
+        carries: node of a world with the joints of a finger; none when empty.
         tick_hz: rate of the control loop.
         capacity: commands that each axis buffers.
         effects: effects beyond the motors' parameters, a table per axis name or "*".
@@ -122,6 +127,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     axis: list[AxisTable]
     beam: list[BeamTable] = []
+    carries: str = ""
     tick_hz: float = 1000.0
     capacity: int = 16384
     effects: dict[str, dict[str, Any]] = {}
@@ -144,7 +150,9 @@ class SimAxes(TickDriver):
         """Tell the axes and the plant; reads the effects file, so that its mistakes show before the start."""
         if not settings.axis:
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
-        _build(settings)
+        motors, _, _ = _build(settings)
+        if settings.carries and (motors is None or motors.position.size < _JOINTS):
+            raise ValueError(f"carries: fewer than {_JOINTS} motors; want those of a finger's joints x, y and th first")
         return cls._describe(settings)
 
     @staticmethod
@@ -161,7 +169,7 @@ class SimAxes(TickDriver):
         if beams:
             port = ChannelInfo("in", minimum=0, maximum=2**beams - 1, width=beams)
             blocks.append(BlockSpec("beams", NodeClass.BINARY, (port,), history=4 * settings.history))
-        inputs = tuple(dict.fromkeys(axis.load_node for axis in axes if axis.load_node))
+        inputs = tuple(dict.fromkeys(node for node in (settings.carries, *(axis.load_node for axis in axes)) if node))
         return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
     make_up_ns: ClassVar[int] = 20_000_000
@@ -189,6 +197,11 @@ class SimAxes(TickDriver):
         servos = [axis for axis in _axes(settings) if axis.motor is not None]
         self._loads = [(row, axis.load_node) for row, axis in enumerate(servos) if axis.load_node]
         self._constant = np.array([axis.motor.load_force for axis in servos])
+        self._borne = self._constant.copy()
+        """Force on each motor beside its drive and what it carries."""
+        mass = np.array([axis.motor.mass for axis in servos[:_JOINTS]])
+        self._carried = Carried(mass, 1 / settings.tick_hz) if settings.carries else None
+        self._most = np.array([axis.motor.force_max for axis in servos[:_JOINTS]])
         self._reading = np.zeros(n)
         self._switches = np.zeros(n, dtype=np.int64)
         self._command: Array | None = None
@@ -213,7 +226,7 @@ class SimAxes(TickDriver):
     def quiet_steps(self, pages: Pages, instants: NDArray[np.int64]) -> QuietSteps | None:
         """Return the steps of motors and steppers, unless something else goes on between commands and positions."""
         motors = self._servos
-        if self._port is not None or self._loads or (motors is not None and motors.has_drive_effects):
+        if self._port is not None or self._loads or self._carried or (motors is not None and motors.has_drive_effects):
             return None
         return QuietAxes(self, pages, instants)
 
@@ -267,13 +280,20 @@ class SimAxes(TickDriver):
         Raises:
             LinkError: one of them is not there.
         """
+        if self._carried is not None:
+            seen = self._seen_at(self.settings.carries, now_ns)
+            stands = int(seen["flags"][0]) & int(AnalogStatus.INVALID)  # while it waits for an axis
+            self._carried.far[:] = 0.0 if stands else seen["value"].reshape(4, -1)
         for row, node in self._loads:
-            reading = self.kit.inputs[node].read(now_ns)
-            if reading is None:
-                self._command = None  # no motion is made up for
-                raise LinkError(f"{node}: no load is known; want the simulated world there")
-            if self._servos is not None:
-                self._servos.load_force[row] = self._constant[row] + float(reading["value"][0])
+            load = self._seen_at(node, now_ns)["value"]
+            self._borne[row] = self._constant[row] + float(load[0])
+
+    def _seen_at(self, node: str, now_ns: int) -> Mapping[str, NDArray[Any]]:
+        reading = self.kit.inputs[node].read(now_ns)
+        if reading is None:
+            self._command = None  # no motion is made up for
+            raise LinkError(f"{node}: no load is known; want the simulated world there")
+        return reading
 
     def _turn(self, now_ns: int, ticks: int) -> None:
         beside_ns = 0
@@ -296,7 +316,7 @@ class SimAxes(TickDriver):
 
     def is_at_rest(self) -> bool:
         """Whether world and command are at a fixed point; turns that are left out then need not be made up for."""
-        if self._command is None or self._has_effects or self._loads:
+        if self._command is None or self._has_effects or self._loads or self._carried:
             return False
         with np.errstate(invalid="ignore"):
             still = bool((np.abs(self._command - self._seen) <= self._near).all())
@@ -322,8 +342,15 @@ class SimAxes(TickDriver):
         return until_ns - time.monotonic_ns() > 2 * _SLACK_NS and self.bank.plan_ahead(_PLANS) > 0
 
     def _advance(self, command: Array) -> None:
-        if self._servos is not None:
-            self._servos.advance(command[self._servo_rows])
+        motors = self._servos
+        if motors is not None:
+            forces = command[self._servo_rows]
+            motors.load_force[:] = self._borne
+            if self._carried is not None:
+                first = slice(_JOINTS)
+                drive = np.clip(forces[first], -self._most, self._most) + self._borne[first]
+                motors.load_force[first] += self._carried.force(motors.position[first], motors.velocity[first], drive)
+            motors.advance(forces)
         if self._steppers is not None:
             self._steppers.advance(command[self._stepper_rows])
 

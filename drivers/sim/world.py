@@ -1,8 +1,9 @@
 """A simulated plane: an object on the platen between rubber fingers that simulated axes carry.
 
 It reads where the axes are from their ``plant`` nodes, integrates finer than its tick, and shows for each finger what
-other simulated devices feel: axes take the loads (``load_node``), force sensors ``fx`` and ``fy``, tactile fingers
-``normal``, ``angle`` and ``curvature``. Where the object truly is shows the node ``pose``, for pictures and tests.
+other simulated devices feel: force sensors ``fx`` and ``fy``, tactile fingers ``normal``, ``angle`` and ``curvature``.
+A second node of each finger, its name with ``_joints``, is what axes carry (``carries``): where each joint is behind
+its spring. Where the object truly is shows the node ``pose``, for pictures and tests.
 
     [device.world]
     driver = "sim-world"
@@ -14,7 +15,8 @@ other simulated devices feel: axes take the loads (``load_node``), force sensors
 
 The stiffness of a mount lies between the axis and its finger, behind the axis's encoder; that of the servo comes in
 series. While an axis is not there the world stands still and its readings are invalid. A world that is killed takes
-what leans on it along: axes with a ``load_node`` of it are lost, fingers and force sensors read invalid.
+what leans on it along: axes that carry a finger or have a ``load_node`` of it are lost, fingers and force sensors read
+invalid. World and axes see each other late; a mount whose damping is too low for that is refused.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from typing import Any, Literal
 import msgspec
 
 from sioms.plant import outline as outlines
+from sioms.plant.carried import most_late
 from sioms.plant.outline import Outline
 from sioms.plant.planar import Body, Finger, Mount, World
 from sioms.plant.skin import skin
@@ -37,7 +40,6 @@ from sioms.sdk.tables import from_table, table_type
 
 MountTable: Any = table_type(Mount)
 
-_STEP_S = 0.25e-3
 _CATCH_UP_S = 0.05
 _INVALID = int(AnalogStatus.INVALID)
 
@@ -55,6 +57,13 @@ _FINGER = (
     ("y_load", "N", "force of the finger on the axis y"),
     ("th_load", "N*m", "torque of the link on the axis th"),
 )
+_JOINTS = tuple(
+    (f"{joint}_{what}", "", f"{what} of the joint {joint} behind its spring, or of that spring")
+    for what in ("place", "speed", "stiffness", "damping")
+    for joint in ("x", "y", "th")
+)
+_LATE_TICKS = 3
+"""How late an axis is seen that ticks no less often, and is held: one tick here, one there, and between them."""
 
 
 class ObjectTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -102,13 +111,15 @@ class SimWorldSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     Attributes:
         object: what lies on the platen.
         finger: the fingers.
-        tick_hz: rate of what is shown; the world goes on in steps of at most 0.25 ms.
+        tick_hz: rate of what is shown.
+        step_s: the world goes on in steps of at most so much [s].
         history: snapshots kept for readers.
     """
 
     object: ObjectTable
     finger: list[FingerTable]
     tick_hz: float = 1000.0
+    step_s: float = 0.25e-3
     history: int = 64
 
 
@@ -124,16 +135,20 @@ class SimWorld(TickDriver):
     @classmethod
     def describe(cls, name: str, settings: SimWorldSettings) -> Description:
         """Tell the object's pose and what each finger feels."""
+        if not 0.0 < settings.step_s < math.inf:
+            raise ValueError(f"step_s {settings.step_s:g}; want above 0, finite")
         _body(settings.object)
         names = [finger.name for finger in settings.finger]
         for index, finger in enumerate(settings.finger):
-            if finger.name in (*names[:index], "pose"):
+            if finger.name in (*names[:index], "pose", *(f"{name}_joints" for name in names)):
                 raise ValueError(f"finger {index}: name {finger.name!r} is taken; want another")
-            from_table(Mount, finger.mount)
+            _check(finger, _LATE_TICKS / settings.tick_hz)
         pose = tuple(ChannelInfo(channel, unit, description="true, of the object") for channel, unit in _POSE)
         felt = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _FINGER)
         blocks = [BlockSpec("pose", NodeClass.ANALOG, pose, history=settings.history)]
+        joints = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _JOINTS)
         blocks += [BlockSpec(one, NodeClass.ANALOG, felt, history=settings.history) for one in names]
+        blocks += [BlockSpec(f"{one}_joints", NodeClass.ANALOG, joints, history=settings.history) for one in names]
         inputs = tuple(dict.fromkeys(node for finger in settings.finger for node in finger.axes if node))
         return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
@@ -148,7 +163,7 @@ class SimWorld(TickDriver):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The pose, then one block for each finger."""
+        """The pose, then one block for what each finger feels, then one for its joints."""
         return self._blocks
 
     def tick(self, now_ns: int) -> None:
@@ -166,7 +181,7 @@ class SimWorld(TickDriver):
             elif elapsed_s > 0.0:
                 elapsed_s = min(elapsed_s, _CATCH_UP_S)
                 self._world.command(known, elapsed_s)
-                self._world.advance(elapsed_s, math.ceil(elapsed_s / _STEP_S))
+                self._world.advance(elapsed_s, math.ceil(elapsed_s / self.settings.step_s))
         self._missing = missing
         self._show(_INVALID if missing else 0)
 
@@ -183,8 +198,13 @@ class SimWorld(TickDriver):
         if world is None:
             return
         self._blocks[0].data[:] = (*world.pose, *world.speed)
-        for block, finger in zip(self._blocks[1:], world.fingers, strict=True):
-            block.data[:] = _felt(finger)
+        count = len(world.fingers)
+        for finger, felt, joints in zip(
+            world.fingers, self._blocks[1 : count + 1], self._blocks[count + 1 :], strict=True
+        ):
+            felt.data[:] = _felt(finger)
+            stiffness, damping, _ = zip(*finger.mount.springs, strict=True)
+            joints.data[:] = (*finger.place, *finger.speed, *stiffness, *damping)
 
 
 def _felt(finger: Finger) -> tuple[float, ...]:
@@ -196,6 +216,23 @@ def _felt(finger: Finger) -> tuple[float, ...]:
         finger.normal, finger.tangential, finger.phi, 1.0 / finger.radius_m, finger.gap_m, float(finger.slides),
         fx, fy, *finger.joint_force,
     )  # fmt: skip
+
+
+def _check(finger: FingerTable, late_s: float) -> None:
+    """Refuse a mount that could not be joined to its axes.
+
+    Raises:
+        ValueError: a number out of its range, or a spring that would swing by the lateness of its ends.
+    """
+    mount = from_table(Mount, finger.mount)
+    for joint, node, (stiffness, damping, mass) in zip(("x", "y", "th"), finger.axes, mount.springs, strict=True):
+        if node and not late_s < most_late(stiffness, damping):
+            least = (0.5 * stiffness * late_s) ** 2 / (stiffness * mass)
+            raise ValueError(
+                f"finger {finger.name}: joint {joint} is a spring of {stiffness:g} with a damping of {damping:g}; it "
+                f"swings where its ends see each other {1e3 * late_s:g} ms late; want a damping_ratio above "
+                f"{0.5 * math.sqrt(least):.2g}, a lower stiffness, more mass, or a higher tick_hz"
+            )
 
 
 def _body(table: ObjectTable) -> Body:

@@ -61,6 +61,16 @@ class Mount:
     shear_loss_s: float = 3e-4
     creep: bool = True
 
+    @property
+    def springs(self) -> tuple[tuple[float, float, float], ...]:
+        """Stiffness and damping of x, y [N/m, N s/m] and th [N m/rad, N m s/rad], and the mass behind each."""
+        return tuple(
+            (stiff, 2.0 * self.damping_ratio * math.sqrt(stiff * mass), mass)
+            for stiff, mass in (
+                (self.stiffness, self.mass), (self.stiffness, self.mass), (self.turn_stiffness, self.inertia),
+            )
+        )  # fmt: skip
+
     def __post_init__(self) -> None:
         for name in ("stiffness", "turn_stiffness", "mass", "inertia", "length_m"):
             if not 0.0 < getattr(self, name) < math.inf:
