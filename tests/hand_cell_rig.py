@@ -37,7 +37,7 @@ ETC = Path(__file__).resolve().parents[1] / "etc"
 DRIVERS: dict[str, Any] = {
     "hand": HandDriver, "sim-axes": SimAxes, "sim-force": SimForce, "sim-tactile": SimTactile, "sim-world": SimWorld,
 }  # fmt: skip
-_COMMON = ("driver", "description", "lease_s", "realtime_priority", "hang_s")
+_COMMON = ("driver", "description", "lease_s", "realtime_priority", "hang_s", "process")
 _LATCHED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT)
 
 

@@ -105,6 +105,7 @@ _CHANNELS = (
     ("force_age", "s", "age of the older of its two readings"),
     ("late", "s", "age of the oldest position of a held axis"),
     ("loop", "s", "from the stamp of the newest force reading to the axes' commands of this tick"),
+    ("pace", "", "of its time: below 1 for a simulated hand in slow motion"),
 )
 
 
@@ -148,6 +149,7 @@ class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw
         least_m: the least d that has a direction; how far the hand may close says the d of the coordinates.
         link_stiffness: of each link and its finger behind the encoder of its axis [N m/rad]; infinite: none gives.
         squeeze: how it squeezes; without it d takes no force commands.
+        pace: of a simulated hand in slow motion, see sioms.hand.slow: what takes 1 s there takes 1/pace s here.
     """
 
     link1_m: float = LINK_M
@@ -155,6 +157,7 @@ class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw
     least_m: float = 1e-3
     link_stiffness: float = math.inf
     squeeze: SqueezeTable | None = None
+    pace: float = 1.0
     tick_hz: float = 400.0
 
 
@@ -185,6 +188,8 @@ class HandDriver(Compound):
             raise ValueError("axis: has a force_node; want the table squeeze, which says from where the force comes")
         if not settings.link_stiffness > 0.0:
             raise ValueError(f"link_stiffness {settings.link_stiffness:g} N m/rad; want more than 0")
+        if not 0.0 < settings.pace <= 1.0:
+            raise ValueError(f"pace {settings.pace:g}; want above 0, at most 1")
         squeeze = settings.squeeze
         if squeeze is None:
             return base
@@ -285,7 +290,9 @@ class HandDriver(Compound):
         loop_s = (self.kit.now_ns() - self._newest_ns) * 1e-9 if is_new and self._drives else math.nan
         block.flags[4] = 0 if math.isfinite(loop_s) else _INVALID
         late_s = (now_ns - self._block.stamp_ns) * 1e-9
-        block.data[:] = (math.nan if force is None else force, felt_n, self._force_age_s, late_s, loop_s)
+        block.data[:] = (
+            math.nan if force is None else force, felt_n, self._force_age_s, late_s, loop_s, self.settings.pace
+        )  # fmt: skip
 
 
 def _nodes(squeeze: SqueezeTable) -> tuple[str, ...]:

@@ -196,7 +196,7 @@ class SimAxes(TickDriver):
         self._servo_rows, self._stepper_rows = np.flatnonzero(~stepper), np.flatnonzero(stepper)
         servos = [axis for axis in _axes(settings) if axis.motor is not None]
         self._loads = [(row, axis.load_node) for row, axis in enumerate(servos) if axis.load_node]
-        self._constant = np.array([axis.motor.load_force for axis in servos])
+        self._constant = self._servos.load_force.copy() if self._servos is not None else np.zeros(0)
         self._borne = self._constant.copy()
         """Force on each motor beside its drive and what it carries."""
         mass = np.array([axis.motor.mass for axis in servos[:_JOINTS]])
@@ -345,7 +345,8 @@ class SimAxes(TickDriver):
         motors = self._servos
         if motors is not None:
             forces = command[self._servo_rows]
-            motors.load_force[:] = self._borne
+            if self._loads or self._carried is not None:
+                motors.load_force[:] = self._borne
             if self._carried is not None:
                 first = slice(_JOINTS)
                 drive = np.clip(forces[first], -self._most, self._most) + self._borne[first]

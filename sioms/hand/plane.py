@@ -22,6 +22,7 @@ from sioms.hand.contacts import FINGER_M, Grasp, grasp_of
 from sioms.hand.control import Controller, Gains
 from sioms.hand.kinematics import LINK_M, Hand, Six
 from sioms.hand.regrasp import NEUTRAL
+from sioms.hand.running import carried_out
 from sioms.hand.touch import Felt, Reading, Setpoint
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.plant.planar import Body, Mount, World
@@ -125,15 +126,7 @@ class PlaneHand:
             Failed: as the skill does.
             TimeoutError: it takes longer than `most_s`.
         """
-        end = self.reading.time_s + most_s
-        try:
-            setpoint = next(ticks)
-            while self.reading.time_s < end:
-                setpoint = ticks.send(self.tick(setpoint))
-        except StopIteration as done:
-            found: T = done.value
-            return found
-        raise TimeoutError(f"run skill: not done in {most_s:g} s")
+        return carried_out(ticks, self.tick, self.reading.time_s, most_s)
 
     def tick(self, setpoint: Setpoint) -> Reading:
         """Go on by a tick; return what is read then."""

@@ -353,7 +353,15 @@ class Skills:
         manner, speed = self.manner, self.manner.closing
         self._goal = list(self.hand.forward(self.now.joints)[:4]) + self._goal[4:]
         pressed_s, since = 0.0, [math.inf, math.inf]  # since when each finger has felt nothing
+        latest_s = self.now.time_s + manner.close_s
         while pressed_s < _MET_S:
+            if self.now.time_s > latest_s:
+                free = [f"finger {i}" for i, gone_s in enumerate(since, 1) if gone_s >= _MET_S] or ["both, in turns"]
+                raise Failed(
+                    Fault.NOTHING_THERE,
+                    f"grasp object: not between both fingers after {manner.close_s:g} s of closing, "
+                    f"{' and '.join(free)} not touched; want an object that both fingers press on",
+                )
             one, two = (gone_s < _MET_S for gone_s in since)
             before_s, both = self.now.time_s, one and two
             drift = 0.0 if one == two else (-0.5 if one else 0.5) * speed

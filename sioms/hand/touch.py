@@ -152,6 +152,7 @@ class Manner:
         moving, turning: speeds in free space [m/s, rad/s].
         rolling: largest |phi'| while an object is rolled [rad/s].
         gain: of the rolling law, towards the end [1/s].
+        close_s: how long it closes at most [s], whatever bounces.
         roll_s: how long it rolls at most [s]; a wedge of two sides may never become parallel.
         clearance_m: by which each finger leaves the object before it moves.
         tolerance_rad: |eta| of a grasp that counts as parallel.
@@ -175,6 +176,7 @@ class Manner:
     turning: float = 1.0
     rolling: float = 0.35
     gain: float = 2.5
+    close_s: float = 30.0
     roll_s: float = 30.0
     clearance_m: float = 8e-3
     tolerance_rad: float = math.radians(0.3)

@@ -204,3 +204,17 @@ def test_a_random_object_is_judged_by_the_truth() -> None:
     assert subject.pose == draw(2).pose and subject.shape == "rectangle" and 0.8 <= subject.friction <= 3.4
     assert outcome.held and not outcome.dropped and outcome.warned and outcome.fault is None
     assert (outcome.regrasps, outcome.rolls) != (0, 0)
+
+
+def test_closing_on_one_that_is_never_met_ends() -> None:
+    hand, skills = plane(disk(20 * MM), (0.0, 0.0, 0.0))
+    skills.manner = replace(skills.manner, close_s=0.5)
+    one = replace(hand.reading.fingers[0], touched=True, phi=math.pi / 2, force=0.1)
+    ticks, reading = skills.grasp(), hand.reading
+    next(ticks)
+    with pytest.raises(Failed, match=r"after 0.5 s of closing, finger 2 not touched") as failed:
+        for _ in range(2000):  # the hand does not get any narrower
+            reading = replace(reading, time_s=reading.time_s + 2.5e-3)
+            ticks.send(reading)
+            reading = replace(reading, fingers=(one, reading.fingers[1]))
+    assert failed.value.fault is Fault.NOTHING_THERE and failed.value.fault.opens

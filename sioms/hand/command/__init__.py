@@ -34,6 +34,7 @@ VERBS: dict[str, Verb] = {
     "roll": Verb("skill", "roll what is held until the grasp is parallel"),
     "hold": Verb("skill", "hold for a time, and keep the grasp parallel by rolling"),
     "release": Verb("skill", "open the hand"),
+    "slow": Verb("slow", "write the configuration of a simulated hand in slow motion, for a slow or busy machine"),
     "trials": Verb("trials", "grasp random convex objects in a simulated plane and count what becomes of them"),
 }
 

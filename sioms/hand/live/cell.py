@@ -5,11 +5,13 @@
         held = hand.run(skills.hold_parallel(5.0))
 
 With every publication of the hand's node the skill is sent a `Reading` and its `Setpoint` becomes a write of six
-commands (`sioms.hand.follow`).
+commands (`sioms.hand.follow`). A simulated hand in slow motion (`sioms.hand.slow`) says its pace in its node `force`:
+skills are shown its own time, and their velocities are slowed down with it.
 """
 
 from __future__ import annotations
 
+import errno
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack
@@ -22,6 +24,7 @@ from sioms.hand.control import Gains
 from sioms.hand.felt import felt, internal_force
 from sioms.hand.follow import Follower, Order, standing
 from sioms.hand.kinematics import Hand, Six
+from sioms.hand.running import carried_out
 from sioms.hand.touch import Failed, Felt, Manner, Reading, Setpoint
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import AXIS_WRITE, WRITE
@@ -34,6 +37,9 @@ _MODE, _VELOCITY, _FORCE = (_NAMES.index(name) for name in ("control_mode", "vel
 _JOG = int(ControlMode.VELOCITY)
 _PRESS = int(ControlMode.FORCE)
 _NEW_S = 1.0
+_FIRST_S = 10.0
+_WATCHED = 40
+_ENOUGH = 0.5
 MANNER = Manner(light_n=0.4)
 """Light touches are a little firmer than on the plane: the platen holds an object against one finger with 0.2 N."""
 _BLIND = Felt(None)
@@ -47,17 +53,19 @@ class CellHand:
         name: of the hand's node.
         fingers: nodes of what each finger feels.
         hand: its modules.
-        gains: of the laws; the damper's are the driver's own.
+        gains: of the laws, in the hand's time; the damper's are the driver's own.
         length_m: of the contact along a finger.
-        lease_s: of the hand's node.
+        lease_s: of the hand's node, in the hand's time.
 
     Attributes:
-        reading: the last one.
+        pace: of the hand's time.
+        reading: the last one, in the hand's time.
         manner: how skills do it here.
         seen: called with every reading and the set-point that answered it.
 
     Raises:
-        OSError: a node that cannot be opened or read.
+        OSError: a node that cannot be opened or read; ETIME, the cell's loops fall behind on this machine, and nothing
+            has moved.
 
     Concurrency: one thread.
     """
@@ -67,10 +75,11 @@ class CellHand:
         gains: Gains = Gains(), length_m: float = 20e-3, lease_s: float = LEASE_S,  # noqa: B008
     ) -> None:  # fmt: skip
         self.hand, self.manner, self._length_m = hand, MANNER, length_m
+        self.pace = _watched(cell, f"{name}.force", fingers)
         self._follower = Follower(gains)
         self.seen: Callable[[Reading, Setpoint], None] | None = None
         with ExitStack() as stack:
-            self._node: AxisNode = stack.enter_context(cell.open(name, "rw", 10.0, lease=lease_s))
+            self._node: AxisNode = stack.enter_context(cell.open(name, "rw", 10.0, lease=lease_s / self.pace))
             self._fingers: list[Any] = [stack.enter_context(cell.open(f"{node}")) for node in fingers]
             self._stream = Stream(self._node, ahead=8)
             self._felt, self._stamps_ns = [_BLIND, _BLIND], [0, 0]
@@ -95,22 +104,15 @@ class CellHand:
         Raises:
             Failed: as the skill does; the hand stands.
             OSError: the hand was stopped, is in fault, or is not there any more.
-            TimeoutError: it takes longer than `most_s`.
+            TimeoutError: it takes longer than `most_s`, in the hand's time.
         """
-        end = self.reading.time_s + most_s
         try:
-            setpoint = next(ticks)
-            while self.reading.time_s < end:
-                setpoint = ticks.send(self.tick(setpoint))
-        except StopIteration as done:
-            self.keep()
-            found: T = done.value
-            return found
-        except Failed:
+            found = carried_out(ticks, self.tick, self.reading.time_s, most_s)
+        except (Failed, TimeoutError):
             self.stop()
             raise
-        self.stop()
-        raise TimeoutError(f"run skill: not done in {most_s:g} s")
+        self.keep()
+        return found
 
     def tick(self, setpoint: Setpoint) -> Reading:
         """Have the set-point carried out; return the next reading."""
@@ -144,14 +146,15 @@ class CellHand:
         return internal_force(*self.reading.fingers) or 0.0
 
     def _write(self, orders: Sequence[Order]) -> None:
-        self._stream.write(b"".join([_record(*order) for order in orders]), replace=True)
+        self._stream.write(b"".join([_record(*order, self.pace) for order in orders]), replace=True)
 
     def _read(self) -> Reading:
         """Wait for the next publication of the hand; read what the fingers feel by then."""
         shown = self._node.wait_new(self._number, _NEW_S)
         self._number = shown.number
         now_ns = time.monotonic_ns()
-        time_s = (now_ns - self._begin_ns) * 1e-9
+        pace_s = self.pace * 1e-9
+        time_s = (now_ns - self._begin_ns) * pace_s
         self._sample_s = max(time_s - self._time_s, 1e-4)
         self._time_s = time_s
         at: Any = tuple(shown.position)
@@ -163,13 +166,37 @@ class CellHand:
                 continue
             self._stamps_ns[i] = frame.stamp_ns
             self._felt[i] = felt(frame.data, self._length_m)
-        ages = [(now_ns - stamp_ns) * 1e-9 for stamp_ns in self._stamps_ns]
-        return Reading(
-            time_s, self.hand.inverse(self._at), (self._felt[0], self._felt[1]), (max(ages[0], 0.0), max(ages[1], 0.0))
-        )
+        ages = [max((now_ns - stamp_ns) * pace_s, 0.0) for stamp_ns in self._stamps_ns]
+        return Reading(time_s, self.hand.inverse(self._at), (self._felt[0], self._felt[1]), (ages[0], ages[1]))
 
 
-def _record(axis: int, presses: bool, value: float) -> bytes:
+def _watched(cell: Workcell, force: str, fingers: Sequence[str]) -> float:
+    """Watch the loops of a hand and its fingers for some ticks; return the pace that the hand shows.
+
+    Raises:
+        OSError: ETIME, one of them is at less than half of its rate.
+    """
+    with ExitStack() as stack:
+        nodes: list[Any] = [stack.enter_context(cell.open(name)) for name in (force, *fingers)]
+        first = [node.wait_new(0, _FIRST_S).number for node in nodes]
+        begun_ns = time.monotonic_ns()
+        time.sleep(_WATCHED / min(node.info.tick_hz for node in nodes))
+        shown = [node.read() for node in nodes]
+        for node, one, since in zip(nodes, shown, first, strict=True):
+            rate = (one.number - since) / ((time.monotonic_ns() - begun_ns) * 1e-9)
+            if rate < _ENOUGH * node.info.tick_hz:
+                raise OSError(
+                    errno.ETIME,
+                    f"take the hand: {node.name} shows {rate:.0f} readings a second here instead of "
+                    f"{node.info.tick_hz:.0f}; want a quieter machine, or a simulated cell in slow motion "
+                    "(sioms hand slow)",
+                )
+        return float(shown[0].measured("pace"))
+
+
+def _record(axis: int, presses: bool, value: float, pace: float) -> bytes:
+    """Return a command of a force [N], or of a velocity in the hand's time."""
     fields: list[Any] = [0] * len(_NAMES)
-    fields[0], fields[_MODE], fields[_FORCE if presses else _VELOCITY] = axis, _PRESS if presses else _JOG, value
+    fields[0], fields[_MODE] = axis, _PRESS if presses else _JOG
+    fields[_FORCE if presses else _VELOCITY] = value if presses else value * pace
     return AXIS_WRITE.pack(*fields)

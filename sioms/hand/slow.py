@@ -1,0 +1,136 @@
+"""A simulated cell of a hand in slow motion: the same motion, forces and places, in a multiple of the time.
+
+A machine that is too slow or too busy for the cell's loops carries the same skills out that way. With pace p every time
+becomes 1/p as long: velocities are p times, accelerations and what stands for forces over mass p^2 times what they
+were, while lengths, forces and stiffnesses stay. Masses and inertias grow by 1/p^2, dampings by 1/p; friction on the
+platen, which goes with the weight, keeps its force. So the trajectory is the same curve, and a fault is the same fault.
+
+Pure: tables in, tables out.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+SLOWEST = 0.01
+PROCESS = "simulation"
+"""In which all simulated devices of a slowed cell are: on a busy machine most of a tick is to be woken for it."""
+Table = dict[str, Any]
+
+_AXIS = {
+    "velocity_max": (1, None), "acceleration_max": (2, None), "jerk_max": (3, None), "velocity_filter_s": (-1, None),
+    "bandwidth_hz": (1, None),
+}  # fmt: skip
+_MOUNT = {"mass": (-2, 1.0), "inertia": (-2, 5e-4), "loss_s": (-1, 1.0), "shear_loss_s": (-1, 3e-4)}
+_SQUEEZE = {
+    "damper": (1, 0.4), "spring_rate": (1, 5.0), "filter_s": (-1, 0.05), "opening_max": (1, 0.1), "damping": (-1, 0.6),
+    "age_max_s": (-1, 0.05),
+}  # fmt: skip
+_POWERS: dict[str, Table] = {
+    "sim-axes": {
+        "tick_hz": (1, 1000.0),
+        "axis": {**_AXIS, "bandwidth_hz": (1, 30.0), "motor": {"mass": (-2, None), "viscous": (-1, None)}},
+    },
+    "sim-world": {
+        "tick_hz": (1, 1000.0), "step_s": (-1, 0.25e-3),
+        "object": {"mass": (-2, 0.1), "platen_friction": (2, 0.2)},
+        "finger": {"mount": _MOUNT},
+    },
+    "sim-tactile": {"tick_hz": (1, 200.0)},
+    "sim-force": {"tick_hz": (1, 1000.0)},
+    "hand": {
+        "tick_hz": (1, 400.0), "lease_s": (-1, None), "late_max_s": (-1, 0.05), "pace": (1, 1.0),
+        "axis": {**_AXIS, "gain": (1, 20.0)}, "squeeze": _SQUEEZE,
+    },
+}  # fmt: skip
+"""Of each driver: by which power of the pace a key goes, and what it is where the configuration does not say."""
+_FILES = ("finger_file", "model_file", "effects_file")
+
+
+def slowed(tables: Mapping[str, Any], pace: float, folder: Path) -> Table:
+    """Return the tables of a cell's configuration at a pace.
+
+    Args:
+        tables: as they are at pace 1, or at another pace, on top of which this one goes.
+        pace: of its time, from 0.01 to 1.
+        folder: of the configuration; files that it names are named by their whole path.
+
+    Raises:
+        ValueError: a pace out of its range, or a device whose driver has no simulation that can be slowed.
+    """
+    if not SLOWEST <= pace <= 1.0:
+        raise ValueError(f"slow cell: a pace of {pace:g}; want {SLOWEST:g} to 1")
+    found: Table = copy.deepcopy(dict(tables))
+    for name, device in found.get("device", {}).items():
+        powers = _POWERS.get(device.get("driver", ""))
+        if powers is None:
+            raise ValueError(
+                f"slow cell: device {name} has the driver {device.get('driver')!r}; want {', '.join(_POWERS)}"
+            )
+        models = [axis.get("model_file") for axis in _axes(device)]
+        if any(models) or device.get("effects") or device.get("effects_file"):
+            raise ValueError(f"slow cell: device {name} has effects, whose times stay; want none")
+        _scale(device, powers, pace)
+        if device["driver"].startswith("sim-"):
+            device.setdefault("process", PROCESS)
+        _whole_paths(device, folder)
+    return found
+
+
+def _axes(device: Table) -> list[Table]:
+    axes = device.get("axis", [])
+    return axes if isinstance(axes, list) else []
+
+
+def _scale(table: Table, powers: Mapping[str, Any], pace: float) -> None:
+    for key, power in powers.items():
+        if isinstance(power, tuple):
+            exponent, usual = power
+            value = table.get(key, usual)
+            if value is not None:
+                table[key] = value * pace**exponent
+            continue
+        below = table.get(key)
+        if below is None and key == "mount":
+            below = table[key] = {}
+        for one in below if isinstance(below, list) else [below]:
+            if one is not None:
+                _scale(one, power, pace)
+
+
+def _whole_paths(table: Table, folder: Path) -> None:
+    for key, value in table.items():
+        if isinstance(value, dict):
+            _whole_paths(value, folder)
+        elif key in _FILES and value:
+            table[key] = str((folder / value).resolve())
+
+
+def toml(tables: Mapping[str, Any]) -> str:
+    """Return a cell's configuration as text: a section for each table of it, one for each device, all else in line."""
+    lines = []
+    for section, content in tables.items():
+        parts = content.items() if section == "device" else [("", content)]
+        for name, table in parts:
+            lines.append(f"\n[{section}.{_key(name)}]" if name else f"\n[{section}]")
+            lines += [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
+    return "\n".join(lines).lstrip() + "\n"
+
+
+def _key(name: str) -> str:
+    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _value(name)
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_key(key)} = {_value(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_value(one) for one in value) + "]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
+    return repr(value)

@@ -1,0 +1,69 @@
+"""A cell in slow motion: the same curve in a multiple of the time."""
+
+from __future__ import annotations
+
+import copy
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hand_cell_rig import HandCell, write
+
+from sioms.hand.follow import D
+from sioms.hand.slow import slowed, toml
+
+ETC = Path(__file__).resolve().parents[3] / "etc"
+
+
+def _tables() -> dict[str, Any]:
+    return tomllib.loads((ETC / "hand.toml").read_text(encoding="utf-8"))
+
+
+@pytest.mark.parametrize("pace", [0.005, 1.5, float("nan")])
+def test_a_pace_that_is_none_is_refused(pace: float) -> None:
+    with pytest.raises(ValueError, match=r"want 0\.01 to 1"):
+        slowed(_tables(), pace, ETC)
+
+
+def test_a_device_that_is_not_simulated_is_refused() -> None:
+    with pytest.raises(ValueError, match="device real has the driver 'modbus-axis'"):
+        slowed({"device": {"real": {"driver": "modbus-axis"}}}, 0.5, ETC)
+
+
+def test_what_is_written_is_what_was_made() -> None:
+    tables = slowed(_tables(), 0.25, ETC)
+    assert tomllib.loads(toml(tables)) == tables
+    assert Path(tables["device"]["touch1"]["shape"]["finger_file"]).is_absolute()
+    assert tables["device"]["hand"]["pace"] == 0.25
+
+
+def test_one_pace_goes_on_top_of_another() -> None:
+    once, twice = slowed(_tables(), 0.125, ETC), slowed(slowed(_tables(), 0.5, ETC), 0.25, ETC)
+    assert toml(once) == toml(twice)  # powers of two are exact
+
+
+def _closing(pace: float) -> list[tuple[float, ...]]:
+    """Close the open hand on the object, with the links soft and the object free; show what moves, in its own time."""
+
+    def change(tables: dict[str, Any]) -> None:
+        for name in ("touch1", "touch2", "wrist1", "wrist2"):  # what they feel is not looked at here
+            tables[name]["tick_hz"] = 20.0
+        tables |= slowed({"device": copy.deepcopy(tables)}, pace, ETC)["device"]
+
+    cell = HandCell(change, compiled=False)
+    seen = []
+    for _ in range(6):
+        write(cell.bank, [(D, False, -0.3 * pace)], cell.now_ns)
+        cell.advance(0.08 / pace)
+        left = cell.drivers["left"].bank.rows["position"]
+        seen.append((*cell.coordinates, *map(float, left), *cell.world.pose))
+    return seen
+
+
+def test_slow_motion_is_the_same_motion() -> None:
+    whole, half = np.array(_closing(1.0)), np.array(_closing(0.5))
+    way = np.abs(whole - whole[0]).max()
+    assert way > 0.1 and np.abs(whole[-1, -3:] - whole[0, -3:]).max() > 1e-3  # it was met, and moved
+    assert np.abs(whole - half).max() < 0.02 * way
