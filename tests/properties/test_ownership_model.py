@@ -48,6 +48,9 @@ SCHEDULES = [
     "request_stop 0, beat, reset 1, crash, hear 0, leave 0, hear 1, leave 1, boot",
     "open 0 0, stop_node 1 0, tick 0, hear 0, move 0 0",
     "open 1 1, hear 1, stop_by_handle 1 1, close 1 1, beat, move 1 1",
+    "kill 1, fail 1, stop 0, reset_node 1 1, listen 1, open 0 1, hear 1, move 0 1",
+    "open 0 0, hear 0, stop_node 1 0, kill 0, open 2 0, fail 0, reset_node 1 0, listen 0, hear 0, move 2 0",
+    "kill 0, fail 0, stop_node 1 0, reset 1, listen 0, open 0 0, hear 0, move 0 0",
     "stop_node 0 0, stop 1, crash, kill 0, kill 1, boot, listen 0, connect 0, open 0 0, hear 0, move 0 0",
 ]
 """Each has broken a promise once, or would with a slip of the pen."""

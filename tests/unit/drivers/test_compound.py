@@ -159,6 +159,17 @@ def test_a_force_that_is_not_known_stops_what_relies_on_it_at_once(change: dict[
     assert slits.blades.rates == [0.0, 0.0]  # nothing goes on by itself
 
 
+@pytest.mark.parametrize("felt", [-30.0, 38.0])
+def test_a_coordinate_that_presses_keeps_its_greatest_velocity(felt: float) -> None:
+    """Though its damper asks for more, and the held axes could."""
+    slits, feeler = _pressing()
+    feeler.force = felt  # 34 N away from what is wanted, at 0.01 m/(s N): 0.34 m/s
+    slits.run(0.01)
+    opening = math.copysign(1.0, felt) * slits.blades.rates[0]
+    assert 0.05 < opening <= 0.1 + 1e-9, "half of 0.2 m/s for each blade; the damper asks for 0.17"
+    assert slits.blades.rates[1] == -slits.blades.rates[0]
+
+
 def test_a_force_that_is_late_but_young_enough_is_followed() -> None:
     slits, feeler = _pressing()
     feeler.late_ns, feeler.flags = 90_000_000, int(AnalogStatus.OVERRUN | AnalogStatus.HIHI)
@@ -229,3 +240,22 @@ def test_devices_that_show_their_axes_at_different_times_do_not_seem_to_part() -
         gaps.append(slits.bank.rows["position"][1])
     assert max(gaps) - min(gaps) < 1e-4
     assert gaps[-1] == pytest.approx(0.2, abs=1e-4)
+
+
+def test_a_stop_of_one_coordinate_halts_all_until_all_are_reset() -> None:
+    slits = Slits()
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.05), [1], slits.now_ns)
+    slits.run(0.2)
+    assert slits.blades.rates[1] > 0.01
+    slits.bank.emergency_stop([0], slits.now_ns)
+    slits.run(0.5)
+    stood = list(slits.blades.at)
+    assert slits.blades.rates == [0.0, 0.0]
+    with pytest.raises(CommandError, match="centre was halted"):
+        slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.05), [1], slits.now_ns)
+    slits.bank.reset([0])
+    slits.run(0.5)
+    assert slits.blades.at == stood and not slits.blades.resets, "one is latched still"
+    slits.bank.reset([0, 1])
+    slits.run(0.5)
+    assert slits.blades.at == pytest.approx(stood, abs=1e-6), "nothing resumes"

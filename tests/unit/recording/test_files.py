@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 from pathlib import Path
@@ -180,6 +181,21 @@ def test_a_file_that_is_cut_off_while_it_is_read_is_read_up_to_there(
             read += list(pieces)
             assert sum(map(len, read)) < 400 and recording.damage[-1].endswith("to the end of the file")
             assert len(recording.table("mod0").numbers) <= 400 and len(recording.events()) <= 5
+
+
+def test_what_cannot_be_packed_leaves_the_file_as_it_was_and_nothing_beside_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write(tmp_path / "a.mcap", 4)
+    whole = path.read_bytes()
+
+    def full(_: int) -> None:
+        raise OSError(errno.ENOSPC, "no space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="no space left"):
+        rewrite([str(path)], str(path))
+    assert [each.name for each in tmp_path.iterdir()] == ["a.mcap"] and path.read_bytes() == whole
 
 
 def test_a_pipe_holds_up_nobody(tmp_path: Path) -> None:
