@@ -140,8 +140,11 @@ class NodeFile:
 
     def beat(self) -> None:
         """Renew the lease of an output, if one of its processes is there and none is stopped."""
-        states = {process: process.state for process in set(self._users.values())}
-        self._users = {tid: process for tid, process in self._users.items() if states.get(process) != "gone"}
+        users = dict(self._users)  # at once: other threads let more processes in meanwhile
+        states = {process: process.state for process in set(users.values())}
+        for tid, process in users.items():
+            if states[process] == "gone" and self._users.get(tid) == process:
+                del self._users[tid]
         if "runs" in states.values() and "stopped" not in states.values() and not self._why:
             with suppress(OSError):  # who uses it next hears of it
                 self.node.keepalive()

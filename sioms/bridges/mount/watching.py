@@ -31,9 +31,17 @@ class Keeper:
     def _run(self) -> None:
         while True:
             time.sleep(self._every_s)
-            for file in self._files():
-                if file.is_output:
-                    file.beat()
+            self.beat()
+
+    def beat(self) -> None:
+        """Renew all; a file for which that fails ends, and the others are renewed."""
+        for file in self._files():
+            if not file.is_output:
+                continue
+            try:
+                file.beat()
+            except Exception as error:  # a mistake of ours halts this one, not everybody's
+                file.end(f"its lease could not be renewed: {error!r}")
 
 
 class Notifier:
