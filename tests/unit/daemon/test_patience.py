@@ -5,6 +5,8 @@ from __future__ import annotations
 import subprocess
 import sys
 
+import pytest
+
 from sioms.daemon.patience import Patience
 from sioms.daemon.stop_files import access_list
 
@@ -29,6 +31,14 @@ def test_a_process_that_gets_no_processor_is_slow_for_ever() -> None:
         process.worked_s += 0.02
         assert patience.stuck(second) == ""
         process.state = "RD"[second % 2]
+
+
+@pytest.mark.parametrize("state", ["R", "D"])
+def test_a_process_that_gets_no_processor_or_disk_at_all_is_not_stuck(state: str) -> None:
+    process = Process()
+    process.state = state
+    patience = process.patience()
+    assert [patience.stuck(second) for second in range(1, 1000)] == [""] * 999
 
 
 def test_a_process_that_works_without_an_end_is_stuck() -> None:
