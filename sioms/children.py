@@ -45,12 +45,16 @@ class Process:
         ready: text that the ready line contains.
         errors: whether it comes on stderr instead of stdout.
         told: whether it takes lines (``tell``).
+        waits: whether to wait for the ready line at once, else ``wait_ready`` has to be called: others may start
+            meanwhile.
 
     Raises:
         RuntimeError: it ended or stayed mute; with what it said.
     """
 
-    def __init__(self, arguments: Sequence[str], ready: str, errors: bool = False, told: bool = False) -> None:
+    def __init__(
+        self, arguments: Sequence[str], ready: str, errors: bool = False, told: bool = False, waits: bool = True
+    ) -> None:
         pipe: dict[str, int] = {"stderr" if errors else "stdout": subprocess.PIPE}
         pipe |= {"stdin": subprocess.PIPE} if told else {}
         self._process = subprocess.Popen(  # type: ignore[call-overload]
@@ -67,12 +71,24 @@ class Process:
             self._heard.put(None)
 
         threading.Thread(target=listen, daemon=True).start()
+        self._name, self._ready = arguments[0], ready
+        if waits:
+            self.wait_ready()
+
+    def wait_ready(self) -> None:
+        """Wait until its ready line has been seen.
+
+        Raises:
+            RuntimeError: it ended or stayed mute; with what it said.
+        """
         deadline = time.monotonic() + PATIENCE_S
-        while (line := self._next(deadline)) is not None and ready not in line:
+        while (line := self._next(deadline)) is not None and self._ready not in line:
             pass
         if line is None:
             self.kill()
-            raise RuntimeError(f"start {arguments[0]}: it did not say {ready!r}; it said: {' | '.join(self.said[-5:])}")
+            raise RuntimeError(
+                f"start {self._name}: it did not say {self._ready!r}; it said: {' | '.join(self.said[-5:])}"
+            )
 
     def _next(self, deadline: float) -> str | None:
         """Return the next line, None when it has ended or stays mute."""

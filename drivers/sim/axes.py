@@ -48,10 +48,8 @@ from sioms.plant.carried import Carried
 from sioms.plant.effects import Effect, build_effects, parse_effects
 from sioms.plant.foreign import Laws, TwinAxes, twin
 from sioms.plant.motor import MotorBank
-from sioms.plant.motor_step import Motors
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
-from sioms.plant.stepper_step import Steppers
 from sioms.protocol.flags import AnalogStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
@@ -60,10 +58,9 @@ from sioms.sdk.exchange import LinkError
 from sioms.sdk.pages import Pages
 from sioms.sdk.tables import from_table, table_type
 
-from .axes_step import SimulatedAxes, advance_axes, rest_axes, tick_axes
+from .axes_step import EDGE
+from .quiet_axes import QuietAxes
 
-# More than this many ticks late, the simulated world stands still instead of catching up.
-_CATCH_UP = 50
 _JOINTS = 3
 # A profile takes some 20 us to plan; few at a time, so that a plan never delays a tick.
 _PLANS, _SLACK_NS = 8, 300_000
@@ -226,7 +223,7 @@ class SimAxes(TickDriver):
     def quiet_steps(self, pages: Pages, instants: NDArray[np.int64]) -> QuietSteps | None:
         """Return the steps of motors and steppers, unless something else goes on between commands and positions."""
         motors = self._servos
-        if self._port is not None or self._loads or self._carried or (motors is not None and motors.has_drive_effects):
+        if self._loads or self._carried or (motors is not None and motors.has_drive_effects):
             return None
         return QuietAxes(self, pages, instants)
 
@@ -237,10 +234,7 @@ class SimAxes(TickDriver):
         made up for, a few at once, and shown each at its own time; what that cannot be done for soon is left to the
         next tick, so that others are served meanwhile. Later than ``late_max_s`` the bank stops all motion.
         """
-        if self._found:
-            found, self._found = self._found, 0
-            self._command = self.bank.finish_tick(found)
-            self._show()
+        if self._found and self._finish_turn(now_ns):
             return
         self._bear(now_ns)
         if self._is_still:  # the turns that were left out change nothing; the world keeps to its grid of ticks
@@ -257,6 +251,20 @@ class SimAxes(TickDriver):
         for block in self.blocks:
             block.stamp_ns = self._last_ns if late else 0
 
+    def _finish_turn(self, now_ns: int) -> bool:
+        """Finish a turn that steps have begun; return whether it was that of the tick, else it is shown as it is."""
+        found, self._found = self._found, 0
+        self._command = self.bank.finish_tick(found & ~EDGE)
+        self._show()
+        if self._port is not None:
+            self._look(self._port, self._last_ns)
+        is_last = round((now_ns - self._last_ns) / self._tick_ns) < 1
+        for block in self.blocks:
+            block.stamp_ns = 0
+            if not is_last:
+                self.kit.publish(block, self._last_ns)
+        return is_last
+
     def _make_up(self, behind: int) -> int:
         """Make up for turns, for as long as that may take, and show them; return how many are left."""
         until_ns = time.monotonic_ns() + self.make_up_ns
@@ -264,7 +272,7 @@ class SimAxes(TickDriver):
             at_ns = self._last_ns + self._stride * self._tick_ns
             self._turn(at_ns, self._stride)
             behind -= self._stride
-            if time.monotonic_ns() >= until_ns:
+            if behind > self._stride and time.monotonic_ns() >= until_ns:
                 break  # this one is shown as that of the tick
             for block in self.blocks:  # what looks at these axes sees them go there
                 self.kit.publish(block, at_ns)
@@ -298,7 +306,7 @@ class SimAxes(TickDriver):
     def _turn(self, now_ns: int, ticks: int) -> None:
         beside_ns = 0
         if self._command is not None:
-            for _ in range(self._ahead, min(ticks, _CATCH_UP)):
+            for _ in range(self._ahead, min(ticks, self._stride)):  # what is later than may be made up for stands still
                 self._advance(self._command)
             self._ahead = max(0, self._ahead - ticks)
             beside_ns = now_ns - self._last_ns - ticks * self._tick_ns
@@ -386,54 +394,6 @@ class SimAxes(TickDriver):
             if index:
                 self.kit.publish(port, now_ns)
             port.set(0, value, stamp_ns)
-
-
-class QuietAxes:
-    """The steps of motors and steppers that move and nothing else (QuietSteps).
-
-    Args:
-        driver: theirs.
-        pages: of the process.
-        instants: where steps note theirs.
-    """
-
-    tick = staticmethod(tick_axes)
-    slack = staticmethod(advance_axes)
-    rest = staticmethod(rest_axes)
-
-    def __init__(self, driver: SimAxes, pages: Pages, instants: NDArray[np.int64]) -> None:
-        self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
-        plant, motors, steppers = self._plant, driver._servos, driver._steppers
-        self.record = SimulatedAxes(
-            period_ns=driver._tick_ns, late_ns=driver._late_ns, stride=driver._stride, ahead=0, last_ns=0, found=0,
-            may_rest=0, still=0, seen=driver._seen,
-            near=driver._near, loop=driver.bank.loop,
-            motors=motors.record if motors else Motors.empty(),
-            steppers=steppers.record if steppers else Steppers.empty(),
-            motor_rows=driver._servo_rows, stepper_rows=driver._stepper_rows,
-            instants=instants, data=plant.data, offset=plant.offset, shown=plant.shown_data,
-            flags=plant.flags, shown_flags=plant.shown_flags,
-            axes=pages.record(self._axes), plant=pages.record(plant),
-        )  # fmt: skip
-
-    def is_ready(self, watched: bool) -> bool:
-        """Tell whether nothing but motion is to be expected."""
-        driver, record = self._driver, self.record
-        if driver._ahead > 1 or driver._found or not self._plant.is_plain:
-            return False
-        if not driver.bank.is_quiet() and not (driver.plan_early() and driver.bank.is_quiet()):
-            return False
-        record.ahead, record.last_ns, record.found = driver._ahead, driver._last_ns, 0
-        record.still = driver._is_still
-        record.may_rest = not watched and not driver._has_effects and driver.bank.is_idle(driver._all)
-        return True
-
-    def resume(self) -> None:
-        """Go on from where the steps have come."""
-        driver, record = self._driver, self.record
-        driver._ahead, driver._last_ns, driver._found = record.ahead, record.last_ns, record.found
-        driver._is_still = bool(record.still)
-        driver.bank.after_quiet()
 
 
 def _switch_bits(bank: MotorBank | StepperBank) -> NDArray[np.int64]:

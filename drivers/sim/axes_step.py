@@ -7,11 +7,14 @@ from typing import Final
 from sioms.motion.axis_step import ENDS, LATE, NOT_FINITE, ODD, WIDE, Loop, quiet_tick
 from sioms.native.language import Floats, Integers, Record, step
 from sioms.native.system import clock_ns
+from sioms.plant.binary_step import Beams, look
 from sioms.plant.motor_step import Motors, bound, coast, is_free
 from sioms.plant.stepper_step import Steppers, turn
-from sioms.sdk.quiet_step import ALIVE, INPUTS, OUTPUTS, Page, publish
+from sioms.sdk.quiet_step import ALIVE, INPUTS, OUTPUTS, Page, publish, shown_as_of
 
 NOT_READY: Final = 1 << 20
+EDGE: Final = 1 << 21
+"""Nothing was done; all was done, but a beam may have changed."""
 UNDONE: Final = LATE | ENDS | NOT_FINITE | WIDE | ODD
 """What a bank finds before it has done anything of a tick."""
 
@@ -20,18 +23,22 @@ class SimulatedAxes(Record):
     """Servos over simulated motors and steppers, each a row of the loop.
 
     ``ahead``: by how many ticks the world has gone on; ``last_ns``: the time of the last one; ``stride``: how many may
-    be made up for at once, up to ``late_ns``. ``may_rest``: axes are at rest when the world is; ``still``: they are,
-    and ticks that are left out change nothing. ``seen``: the command of the tick before, and how ``near`` the next must
-    be to be the same. ``found`` by the bank in a tick that is half done. ``data`` and ``flags`` of the plant, as they
-    are and as ``shown`` less the ``offset``.
+    be made up for at once, for ``make_up_ns`` a tick, up to ``late_ns``. ``plain``: a fixed point of the world shows;
+    ``idle``: no axis has anything to do; ``may_rest``: the loop wants to know of both; ``still``: it is so, and ticks
+    that are left out change nothing. ``seen``: the command of the tick before, and how ``near`` the next must be to be
+    the same. ``found`` by the bank in a tick that is half done, and EDGE. ``data`` and ``flags`` of the plant,
+    as they are and as ``shown`` less the ``offset``. The page of the port is there where there are ``beams``.
     """
 
     period_ns: int
     late_ns: int
+    make_up_ns: int
     stride: int
     ahead: int
     last_ns: int
     found: int
+    plain: int
+    idle: int
     may_rest: int
     still: int
     seen: Floats
@@ -39,6 +46,7 @@ class SimulatedAxes(Record):
     loop: Loop
     motors: Motors
     steppers: Steppers
+    beams: Beams
     motor_rows: Integers
     stepper_rows: Integers
     instants: Integers
@@ -49,43 +57,50 @@ class SimulatedAxes(Record):
     shown_flags: Integers
     axes: Page
     plant: Page
+    port: Page
 
 
 @step
 def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
-    """Measure, command, publish; ticks that were missed are made up for. Returns what the driver has to see to, 0 for
-    nothing.
+    """Measure, command, publish; ticks that were missed are made up for, and each is published with its own time. What
+    that cannot be done for soon is left to the next tick. Returns what the driver has to see to, 0 for nothing.
     """
     behind = int((now_ns - s.last_ns) / s.period_ns)
     if behind < 1 or behind * s.period_ns != now_ns - s.last_ns or now_ns - s.last_ns > s.late_ns:
         return NOT_READY
-    if s.still:  # what was left out changes nothing
+    if s.still or (behind > s.stride and stands(s)):  # what was left out changes nothing
         s.last_ns += (behind - 1) * s.period_ns
         behind = 1
-    while behind > s.stride:
-        found = turn_axes(s, s.last_ns + s.stride * s.period_ns, s.stride)
-        if found:
-            return found
-        behind -= s.stride
-    found = turn_axes(s, now_ns, behind)
+    until_ns = clock_ns() + s.make_up_ns
+    shown_ns = shown_as_of(s.axes)
+    ticks = min(behind, s.stride)
+    found = turn_axes(s, s.last_ns + ticks * s.period_ns, ticks)
+    behind -= ticks
+    while not found and behind and (behind <= s.stride or clock_ns() < until_ns):
+        show_axes(s, s.last_ns, shown_ns, number)
+        ticks = min(behind, s.stride)
+        found = turn_axes(s, s.last_ns + ticks * s.period_ns, ticks)
+        behind -= ticks
     if found:
         return found
     s.instants[OUTPUTS] = clock_ns()
-    m = s.motors
-    p = s.steppers
-    for j in range(m.n):
-        s.data[2 * s.motor_rows[j]] = m.position[j]
-        s.data[2 * s.motor_rows[j] + 1] = m.contact_force[j]
-    for j in range(p.n):
-        s.data[2 * s.stepper_rows[j]] = p.position[j]
+    s.axes.words[ALIVE] = s.instants[OUTPUTS]
+    s.plant.words[ALIVE] = s.instants[OUTPUTS]
+    if s.beams.n:
+        s.port.words[ALIVE] = s.instants[OUTPUTS]
+    show_axes(s, s.last_ns, as_of_ns, number)
+    return 0
+
+
+@step
+def show_axes(s: SimulatedAxes, stamp_ns: int, as_of_ns: int, number: int) -> int:
+    """Publish axes, plant and port as they were at a time."""
     for i in range(2 * s.loop.n):
         s.shown[i] = s.data[i] - s.offset[i]
         s.shown_flags[i] = s.flags[i]
-    s.axes.words[ALIVE] = s.instants[OUTPUTS]
-    s.plant.words[ALIVE] = s.instants[OUTPUTS]
-    publish(s.axes, now_ns, number, as_of_ns)
-    publish(s.plant, now_ns, number, as_of_ns)
-    return 0
+    publish(s.axes, stamp_ns, number, as_of_ns)
+    publish(s.plant, stamp_ns, number, as_of_ns)
+    return publish(s.port, stamp_ns, number, as_of_ns) if s.beams.n else 0
 
 
 @step
@@ -111,8 +126,21 @@ def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int) -> int:
     s.ahead = 0
     s.still = 0
     s.last_ns = now_ns
-    s.found = found
-    return found
+    for j in range(m.n):
+        s.data[2 * s.motor_rows[j]] = m.position[j]
+        s.data[2 * s.motor_rows[j] + 1] = m.contact_force[j]
+    for j in range(p.n):
+        s.data[2 * s.stepper_rows[j]] = p.position[j]
+    s.found = found | look_at_axes(s, now_ns)
+    return s.found
+
+
+@step
+def look_at_axes(s: SimulatedAxes, now_ns: int) -> int:
+    """Return EDGE when a beam may have changed on the way of the axes to where they are now."""
+    for j in range(s.beams.m):
+        s.beams.now[j] = s.data[2 * j]
+    return EDGE if s.beams.n and look(s.beams, now_ns) else 0
 
 
 @step
@@ -143,10 +171,16 @@ def move_axes(s: SimulatedAxes) -> int:
 
 @step
 def rest_axes(s: SimulatedAxes, a: int, b: int, c: int) -> int:
+    """Return whether world and command are at a fixed point and nobody looks."""
+    return stands(s) if s.may_rest else 0
+
+
+@step
+def stands(s: SimulatedAxes) -> int:
     """Return whether world and command are at a fixed point, as ``SimAxes.is_at_rest`` does."""
-    if not s.may_rest:
+    if not s.plain:
         return 0
-    s.still = 1
+    s.still = s.idle
     for i in range(s.loop.n):
         if not abs(s.loop.actuator[i] - s.seen[i]) <= s.near[i]:
             s.still = 0

@@ -315,6 +315,8 @@ class AxisBank(Bank):
             return
         after, most = (now_ns - last_ns) * 1e-6, self._late_ns * 1e-6
         text = f"the tick came {after:.1f} ms after the last; at most {most:g} ms"
+        if self._makes_up():
+            text = f"simulated time is {after:.0f} ms behind on this busy machine; at most {most:g} ms"
         self._homing.cancel(moving)
         sequencer.drop(moving)
         sequencer.stop(moving, last_ns, now_ns)

@@ -35,6 +35,7 @@ MODULES: tuple[str, ...] = (
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
     "sioms.plant.stepper_step",
+    "sioms.plant.binary_step",
     "sioms.sdk.quiet_step",
     "sioms.drivers.sim.axes_step",
 )

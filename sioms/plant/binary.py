@@ -7,6 +7,10 @@ finer than the tick in which they are found.
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
+from .binary_step import Beams
+
 
 @dataclass(frozen=True, slots=True)
 class Edge:
@@ -72,13 +76,21 @@ class Beam:
 
     Args:
         boxes: the beam is broken while any of them holds.
+
+    Attributes:
+        broken: at the last look.
+        positions, stamp_ns: of the last look; None and 0 before the first.
     """
 
     def __init__(self, boxes: Sequence[Box]) -> None:
-        self._boxes = tuple(boxes)
-        self._positions: tuple[float, ...] | None = None
-        self._stamp_ns = 0
+        self.boxes = tuple(boxes)
+        self.positions: tuple[float, ...] | None = None
+        self.stamp_ns = 0
         self.broken = False
+
+    def pass_over(self, positions: Sequence[float], stamp_ns: int) -> None:
+        """Take the positions at a time on the way to which nothing has changed, as somebody else has found."""
+        self.positions, self.stamp_ns = tuple(positions), stamp_ns
 
     def sample(self, positions: Sequence[float], stamp_ns: int) -> list[Edge]:
         """Take the positions at a time and return the edges since the last sample, oldest first.
@@ -90,10 +102,10 @@ class Beam:
             stamp_ns: time they hold for [ns].
         """
         now = tuple(positions)
-        before = now if self._positions is None else self._positions
-        since_ns = stamp_ns if self._positions is None else self._stamp_ns
-        self._positions, self._stamp_ns = now, stamp_ns
-        spans = _union([span for box in self._boxes if (span := box.span(before, now))])
+        before = now if self.positions is None else self.positions
+        since_ns = stamp_ns if self.positions is None else self.stamp_ns
+        self.pass_over(now, stamp_ns)
+        spans = _union([span for box in self.boxes if (span := box.span(before, now))])
         changes: list[tuple[float, bool]] = []
         if self.broken and (not spans or spans[0][0] > 0.0):
             changes.append((0.0, False))
@@ -105,6 +117,26 @@ class Beam:
         if changes:
             self.broken = changes[-1][1]
         return [Edge(since_ns + round((stamp_ns - since_ns) * part), level) for part, level in changes]
+
+
+def beams_record(beams: Sequence[Beam], coordinates: int) -> Beams:
+    """Return beams as steps see them, for ``look``; what changes is not filled in.
+
+    Args:
+        beams: which.
+        coordinates: how many positions they look at.
+    """
+    boxes = [box for beam in beams for box in beam.boxes]
+    intervals = [interval for box in boxes for interval in box.intervals]
+    ends = np.cumsum([0] + [len(beam.boxes) for beam in beams], dtype=np.int64)
+    inner = np.cumsum([0] + [len(box.intervals) for box in boxes], dtype=np.int64)
+    return Beams(
+        n=len(beams), m=coordinates if beams else 0, looked_ns=0, boxes=ends, intervals=inner,
+        coordinate=np.array([c for c, _, _ in intervals], dtype=np.int64),
+        low=np.array([low for _, low, _ in intervals], dtype=np.float64),
+        high=np.array([high for _, _, high in intervals], dtype=np.float64),
+        broken=np.zeros(len(beams), dtype=np.bool_), before=np.zeros(coordinates), now=np.zeros(coordinates),
+    )  # fmt: skip
 
 
 def _union(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:

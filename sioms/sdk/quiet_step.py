@@ -138,6 +138,12 @@ def publish(p: Page, stamp_ns: int, tick: int, as_of_ns: int) -> int:
 
 
 @step
+def shown_as_of(p: Page) -> int:
+    """Return up to which instant everything shows in the newest snapshot [ns]."""
+    return p.words[FIRST + (p.number & p.mask) * p.slot + 3]
+
+
+@step
 def record(q: Quiet, ended_ns: int, slack_ns: int) -> int:
     """Note the times of the last tick, as ``TickStatistics.record`` does."""
     i = q.ticks & (RING - 1)

@@ -88,7 +88,7 @@ def kill_to_halt(cell: sioms.Workcell, trials: int) -> Row:
             victim = _running_victim(watch)
             killed_ns = victim.kill()
             times.append((_first_slower(watch, 0.0999, killed_ns) - killed_ns) / 1e3)
-            _wait(lambda: not watch.read().in_motion[0])
+            wait_for_rest(watch)
     return row("client killed to its axis braking", times)
 
 
@@ -102,7 +102,7 @@ def stop_to_halt(cell: sioms.Workcell, trials: int) -> Row:
             cell.emergency_stop(why="measurement")
             slower_ns = max(_first_slower(node, 0.0499, called_ns) for node in (first, second))
             times.append((slower_ns - called_ns) / 1e3)
-            _wait(lambda: not any(first.read().in_motion) and not any(second.read().in_motion))
+            wait_for_rest(first, second)
             cell.reset()
             time.sleep(0.01)
     return row("emergency stop to all axes braking", times)
@@ -116,7 +116,7 @@ def _running_victim(watch: Any) -> Process:
         if _seen_running([watch], [[velocity]]):
             return victim
         victim.kill()
-        _wait(lambda: not watch.read().in_motion[0])
+        wait_for_rest(watch)
 
 
 def _run_together(*nodes: Any) -> None:
@@ -129,7 +129,7 @@ def _run_together(*nodes: Any) -> None:
             return
         for node in nodes:
             node.stop()
-        _wait(lambda: not any(any(node.read().in_motion) for node in nodes))
+        wait_for_rest(*nodes)
 
 
 def _seen_running(nodes: Sequence[Any], velocities: Sequence[Any]) -> bool:
@@ -147,7 +147,7 @@ def _seen_running(nodes: Sequence[Any], velocities: Sequence[Any]) -> bool:
         if running:
             return True
         time.sleep(0.001)
-    raise RuntimeError("the axes did not do what they were told to do")
+    raise RuntimeError(f"{', '.join(node.name for node in nodes)} did not run as commanded in {PATIENCE_S:g} s")
 
 
 def _first_slower(node: Any, velocity: float, after_ns: int) -> int:
@@ -160,14 +160,19 @@ def _first_slower(node: Any, velocity: float, after_ns: int) -> int:
             if snapshot.stamp_ns > after_ns and abs(snapshot.commanded_velocity[0]) < velocity:
                 return int(snapshot.stamp_ns)
         time.sleep(0.0005)
-    raise RuntimeError(f"{node.name} did not slow down in time")
+    raise RuntimeError(f"{node.name} did not slow down in {PATIENCE_S:g} s")
 
 
-def _wait(condition: Callable[[], bool]) -> None:
+def wait_for_rest(*nodes: Any) -> None:
+    """Wait until no axis of some nodes is in motion any more.
+
+    Raises:
+        RuntimeError: some are still, after ``PATIENCE_S``.
+    """
     deadline = time.monotonic() + PATIENCE_S
-    while not condition():
+    while moving := [node.name for node in nodes if any(node.read().in_motion)]:
         if time.monotonic() > deadline:
-            raise RuntimeError("the axis did not do what it was told to do")
+            raise RuntimeError(f"{', '.join(moving)} did not come to rest in {PATIENCE_S:g} s")
         time.sleep(0.001)
 
 

@@ -1,12 +1,36 @@
-"""What the demo prints and runs: headings, and pipe tools with what they print."""
+"""What the demo prints and runs: headings, what it waits for, and pipe tools with what they print."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from sioms.children import PATIENCE_S, ends_with_us
+
+SLOW_S = 3.0
+"""A wait that takes longer is told of [s]."""
+
+
+@contextmanager
+def waiting(what: str) -> Iterator[None]:
+    """Say what is waited for where that takes long, and where it fails.
+
+    Raises:
+        RuntimeError: what is done within fails, or takes too long.
+    """
+    told = threading.Timer(SLOW_S, print, (f"  waiting for {what} ...",), {"flush": True})
+    told.daemon = True
+    told.start()
+    try:
+        yield
+    except (OSError, RuntimeError) as error:
+        raise RuntimeError(f"wait for {what}: {error}") from error
+    finally:
+        told.cancel()
 
 
 def bold(text: str) -> str:

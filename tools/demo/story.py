@@ -8,6 +8,7 @@ import os
 import shutil
 import tempfile
 import time
+from collections.abc import Callable
 from importlib.resources import files
 
 import sioms
@@ -17,7 +18,7 @@ from sioms.client.command import command
 from . import measure
 from .pace import RATES, paced, rate_for, share
 from .recorder import Recorder
-from .rig import bold, tool
+from .rig import bold, tool, waiting
 
 
 def tell(out: str, quick: bool, wire: bool) -> int:
@@ -28,7 +29,8 @@ def tell(out: str, quick: bool, wire: bool) -> int:
         _chapter("Start the daemon", f"siomsd --config {os.path.relpath(config)}")
         config = _paced(config, folder)
         began = time.monotonic()
-        process = daemon(config, f"{folder}/demo.sock")
+        with waiting("siomsd to start its drivers"):
+            process = daemon(config, f"{folder}/demo.sock")
         try:
             with sioms.Workcell(name="demo") as cell:
                 _say(f"ready after {time.monotonic() - began:.2f} s")
@@ -127,7 +129,8 @@ class _Show:
         except ImportError:
             _say("left out: matplotlib is not installed (pip install 'sioms[report]')")
         else:
-            draw(f"{self._out}/demo.png", self._rows, self._recorder.events, self._chapters)
+            with waiting("the picture"):
+                draw(f"{self._out}/demo.png", self._rows, self._recorder.events, self._chapters)
             _say(f"{self._out}/demo.png")
         self._latencies(quick)
 
@@ -150,10 +153,11 @@ class _Show:
             picked, placed = cell.reserve_markers(2)
             start_ns = self._start_together(mod0, mod1, int(picked), int(placed))
             self._note("synch: both modules start", start_ns)
-            self._note("marker 1: mod0 has picked", picked.wait(PATIENCE_S))
-            self._note("marker 2: mod1 has made room", placed.wait(PATIENCE_S))
-            mod0.wait_until_idle(PATIENCE_S)
-            mod1.wait_until_idle(PATIENCE_S)
+            with waiting("marker 1, which mod0 signals"):
+                self._note("marker 1: mod0 has picked", picked.wait(PATIENCE_S))
+            with waiting("marker 2, which mod1 signals"):
+                self._note("marker 2: mod1 has made room", placed.wait(PATIENCE_S))
+            self._rest(mod0, mod1)
             self._note("both modules at rest")
 
     def _start_together(self, mod0: sioms.AxisNode, mod1: sioms.AxisNode, picked: int, placed: int) -> int:
@@ -185,7 +189,12 @@ class _Show:
             lead_s *= 4.0
             for node in (mod0, mod1):
                 node.stop()
-            for node in (mod0, mod1):
+            self._rest(mod0, mod1)
+
+    @staticmethod
+    def _rest(*nodes: sioms.AxisNode) -> None:
+        for node in nodes:
+            with waiting(f"{node.name} to come to rest"):
                 node.wait_until_idle(PATIENCE_S)
 
     def _beam(self) -> None:
@@ -196,10 +205,12 @@ class _Show:
         )
         with self._cell.open("mod0.xaxis", "rw", PATIENCE_S) as axis, self._cell.open("beam0") as beam:
             axis.move(0.0, max_velocity=0.25, max_acceleration=3.0)
-            broken = beam.wait_event(timeout=PATIENCE_S)
+            with waiting("beam 0 to be broken by mod0.xaxis"):
+                broken = beam.wait_event(timeout=PATIENCE_S)
             awake_us = (time.monotonic_ns() - broken.stamp_ns) / 1e3
             self._note("beam 0 broken", broken.stamp_ns)
-            free = beam.wait_event(last=broken, timeout=PATIENCE_S)
+            with waiting("beam 0 to be free again"):
+                free = beam.wait_event(last=broken, timeout=PATIENCE_S)
             axis.move(0.12, replace=True, max_velocity=0.6, max_acceleration=6.0)
             self._note("beam 0 free again: turn back", free.stamp_ns)
             width_mm = (free.stamp_ns - broken.stamp_ns) / 1e9 * 0.25 * 1e3
@@ -207,7 +218,7 @@ class _Show:
                 f"awake {awake_us:.0f} us after the edge; the edges' stamps make the beam {width_mm:.2f} mm wide (it "
                 "is 40 mm)"
             )
-            axis.wait_until_idle(PATIENCE_S)
+            self._rest(axis)
 
     def _finger(self) -> None:
         self._begin(
@@ -225,8 +236,9 @@ class _Show:
             finger.zero(20)
             # However late this program may be to stop it, it presses no deeper than 1.5 mm, with 6 N.
             axis.move(0.0215, max_velocity=0.02, max_acceleration=4.0)
-            while abs(sensor.read().measured(2)) < 0.5:
-                sensor.wait_new(sensor.read().number, PATIENCE_S)
+            with waiting("a force above 0.5 N at lord1"):
+                while abs(sensor.read().measured(2)) < 0.5:
+                    sensor.wait_new(sensor.read().number, PATIENCE_S)
             self._note("touch: force above 0.5 N")
             axis.command(force=6.0, time=0.8, replace=True)
             time.sleep(0.7)
@@ -240,9 +252,9 @@ class _Show:
                 f"shape: {math.degrees(felt['angle']):.2f} +- {math.degrees(felt['var_angle'] ** 0.5):.2f} deg, "
                 f"{felt['load']:.0f} N/m, radius {1e3 * felt['radius']:.1f} mm (it is 6 mm)"
             )
-            axis.wait_until_idle(PATIENCE_S)
+            self._rest(axis)
             axis.move(0.0)
-            axis.wait_until_idle(PATIENCE_S)
+            self._rest(axis)
             self._note("finger free again")
 
     def _pipes(self) -> None:
@@ -252,7 +264,8 @@ class _Show:
             ["devout", "-pt", "mod0.xaxis", "0.05", "0.4"],
             ["devin", "-n0p", "mod0"],
         ):
-            text = tool(name, *arguments)
+            with waiting(f"{name} to end"):
+                text = tool(name, *arguments)
             _say(f"$ {name} {' '.join(arguments)}")
             for line in text.splitlines():
                 _say(line)
@@ -260,17 +273,20 @@ class _Show:
     def _kill(self) -> None:
         self._begin("Kill a client in mid-motion", "SIGKILL; nobody is left to say stop", "client killed")
         with self._cell.open("mod0.xaxis.readonly") as watch:
-            victim = Process(["sioms.tools.demo.victim", "mod0.xaxis", "0.2"], "moving")
+            with waiting("a client that moves mod0.xaxis"):
+                victim = Process(["sioms.tools.demo.victim", "mod0.xaxis", "0.2"], "moving")
             time.sleep(0.6)
             try:
                 self._cell.open("mod0.xaxis", "rw").close()
             except OSError as error:
                 _say(f"before: {error.strerror}")
             self._note("SIGKILL to the client", victim.kill())
-            time.sleep(0.15)
+            with waiting("the axis of the killed client to come to rest"):
+                measure.wait_for_rest(watch)
             reading = watch.read()[0]
             self._note(f"axis at rest: {abs(reading.velocity):.4f} m/s")
-            self._cell.open("mod0.xaxis", "rw", PATIENCE_S).close()
+            with waiting("mod0.xaxis to be free"):
+                self._cell.open("mod0.xaxis", "rw", PATIENCE_S).close()
             _say("and free for the next client")
 
     def _stop(self) -> None:
@@ -293,21 +309,24 @@ class _Show:
             for node in (mod0, mod1):
                 node.write([command(axis, position=0.0) for axis in range(2)])
             self._note("new commands: back to zero")
-            mod0.wait_until_idle(PATIENCE_S)
-            mod1.wait_until_idle(PATIENCE_S)
+            self._rest(mod0, mod1)
 
     def _latencies(self, quick: bool) -> None:
         _chapter("How fast", "medians and worst cases of this run on this machine")
         few, many = (5, 500) if quick else (25, 5000)
         cell = self._cell
-        rows = [
-            measure.socket_round_trip(many),
-            measure.reading(cell, many),
-            measure.writing(cell, many // 5),
-            measure.edge_to_client(cell, few),
-            measure.kill_to_halt(cell, few),
-            measure.stop_to_halt(cell, few),
+        rows: list[measure.Row] = []
+        measurements: list[Callable[[], measure.Row]] = [
+            lambda: measure.socket_round_trip(many),
+            lambda: measure.reading(cell, many),
+            lambda: measure.writing(cell, many // 5),
+            lambda: measure.edge_to_client(cell, few),
+            lambda: measure.kill_to_halt(cell, few),
+            lambda: measure.stop_to_halt(cell, few),
         ]
+        for measured in measurements:
+            with waiting(f"measurement {len(rows) + 1} of {len(measurements)}"):
+                rows.append(measured())
         base = rows[0].median_us
         _say(f"{'':38} {'median':>11} {'worst':>12} {'trials':>7} {'round trips':>12}")
         for row in rows:

@@ -353,6 +353,34 @@ def test_a_machine_that_is_too_slow_shows_its_axes_in_slow_motion_and_ends_each_
     assert went == pytest.approx(0.1 * (bench.clock_ns - began_ns) * 1e-9, rel=1e-6)
 
 
+@pytest.mark.parametrize("column, value", [("velocity", 0.3), ("position", 0.4)])
+def test_a_machine_that_is_too_slow_for_long_stops_its_axes_and_says_why(bench, column, value):
+    """It falls no further behind than late_max_s, and nothing goes faster than the limits meanwhile."""
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO], "late_max_s": 0.2})
+    mod.make_up_ns = 0
+    bench.run(0.01)
+    bench.write(mod, control_mode=ControlMode[column.upper()], **{column: value})
+    for _ in range(60):  # one turn each; while it accelerates, the plan passes 0.3 m/s after 60 ms
+        bench.run(0.001)
+    fastest = 0.0
+    for _ in range(12):
+        bench.clock_ns += 30_000_000
+        bench.run(0.001)
+        assert bench.clock_ns - mod._last_ns <= 230_000_000
+        fastest = max(fastest, abs(mod._servos.velocity[0]))
+    assert status(mod) & AxisStatus.FAULT
+    assert "simulated time is" in mod.bank.fault_text(0) and "at most 200 ms" in mod.bank.fault_text(0)
+    mod.make_up_ns = 10**12
+    for _ in range(1000):
+        bench.run(0.001)
+        fastest = max(fastest, abs(mod._servos.velocity[0]))
+    assert fastest < 0.51 and mod._servos.velocity[0] == 0.0
+    mod.bank.reset([0])
+    bench.write(mod, control_mode=ControlMode.POSITION, position=0.0)
+    bench.run(3.0, until=lambda: mod.bank.is_idle([0]))
+    assert mod.bank.rows["position"][0] == pytest.approx(0.0, abs=1e-4), "and can be used again"
+
+
 def test_a_world_that_is_late_and_at_rest_has_nothing_to_make_up_for(bench):
     mod = bench.make(SimAxes, "mod0", {"axis": [SERVO], "late_max_s": 30.0})
     bench.run(0.01)

@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sioms.plant.binary import Beam, Box, Edge, Gripper, SquareWave
+from sioms.plant.binary import Beam, Box, Edge, Gripper, SquareWave, beams_record
+from sioms.plant.binary_step import look
 
 MS = 1_000_000
 
@@ -58,6 +59,35 @@ def test_any_path_gives_alternating_ordered_edges_and_the_right_level(path):
             assert edge.level != level and last <= edge.stamp_ns <= tick * 1000
             level, last = edge.level, edge.stamp_ns
         assert beam.broken == level == (-0.25 <= position <= 0.1 or 0.3 <= position <= 0.305)
+
+
+def test_a_quick_look_finds_nothing_only_where_nothing_is():
+    rng, quiet = np.random.default_rng(3), 0
+    for world in range(40):
+        beams = [
+            Beam([
+                Box(tuple((c, *sorted(rng.integers(0, 9, 2) / 8)) for c in rng.choice(2, rng.integers(1, 3), False)))
+                for _ in range(rng.integers(1, 4))
+            ])
+            for _ in range(rng.integers(1, 4))
+        ]  # fmt: skip
+        record, place = beams_record(beams, 2), rng.random(2)
+        for tick in range(200):
+            place = place if rng.random() < 0.2 else np.clip(place + rng.choice([0.0, 0.01, 0.125, -0.125], 2), 0, 1)
+            for coordinate in range(2):
+                record.now[coordinate] = place[coordinate]
+            looked = tick and not look(record, tick)
+            edges = [edge for beam in beams for edge in beam.sample(place.tolist(), tick)]
+            assert not (looked and edges), f"world {world}, tick {tick}"
+            quiet += bool(looked)
+            if not looked:
+                record.looked_ns = tick
+                for k, beam in enumerate(beams):
+                    record.broken[k] = beam.broken
+                for coordinate in range(2):
+                    record.before[coordinate] = place[coordinate]
+            assert list(record.before) == place.tolist() and record.looked_ns == tick
+    assert quiet > 4000, "and mostly that is seen"
 
 
 def test_square_wave_edges_match_its_level_however_cut():

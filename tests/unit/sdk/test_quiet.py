@@ -4,6 +4,7 @@ from types import MappingProxyType
 
 import msgspec
 import numpy as np
+import pytest
 
 from sioms.drivers.sim.axes import SimAxes
 from sioms.motion import CommandError
@@ -24,26 +25,36 @@ STEPPER = {"mass": 0.1, "step": 1e-3, "hold_force": 20.0, "coulomb": 1.0, "limit
 AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 40.0, "position_min": -0.2, "position_max": 0.28}
 
 
+BEAMS = [{"boxes": [{"a": [0.02, 0.05]}, {"a": [0.04, 0.06], "c": [0.0, 1.0]}]}, {"boxes": [{"b": [-0.01, 0.0]}]}]
+
+
 class Kit:
     markers = None
     inputs = MappingProxyType({})
 
+    def __init__(self, cell):
+        self.cell = cell
+
     def log(self, level, text): ...
 
-    def publish(self, block, stamp_ns): ...
+    def publish(self, block, stamp_ns):
+        """Publish in the middle of a tick: nothing has been served since the last one."""
+        pages = self.cell.pages
+        pages.publish(block, stamp_ns, self.cell.number, pages.as_of_ns(block))
 
 
 class Cell:
     """A driver with its pages, ticked as the loop does, by steps where it may."""
 
-    def __init__(self, by_steps):
+    def __init__(self, by_steps, make_up_ns=10**15):
         axes = [
             AXIS | {"name": "a", "motor": MOTOR},
             {k: v for k, v in AXIS.items() if k != "force_max"} | {"name": "c", "stepper": STEPPER},
             AXIS | {"name": "b", "motor": MOTOR | {"wall": {"position": 0.15, "stiffness": 2e4, "damping": 20.0}}},
         ]
-        settings = msgspec.convert({"axis": axes}, SimAxes.Settings)
-        self.driver = SimAxes("mod0", settings, Kit())
+        settings = msgspec.convert({"axis": axes, "beam": BEAMS}, SimAxes.Settings)
+        self.driver = SimAxes("mod0", settings, Kit(self))
+        self.driver.make_up_ns = make_up_ns
         self.pages = Pages("mod0", self.driver.blocks, 10**9, 1, lambda blocks, state, reason: None)
         self.instants = np.zeros(2, dtype=np.int64)
         steps = self.driver.quiet_steps(self.pages, self.instants)
@@ -55,7 +66,7 @@ class Cell:
         if not (self.steps and self.by_step(now_ns)):
             self.driver.tick(now_ns)
             for block in self.driver.blocks:
-                self.pages.publish(block, now_ns, self.number, now_ns)
+                self.pages.publish(block, block.stamp_ns or now_ns, self.number, now_ns)
             self.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
 
     def rest(self, now_ns, watched=False):
@@ -96,33 +107,77 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
     monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))  # plans are made ahead, whatever the time is
     plain, quiet = Cell(False), Cell(True)
     rng, now_ns, refused = np.random.default_rng(5), 1_000_000_000, 0
-    for tick in range(5000):
-        now_ns += PERIOD_NS * (1 if rng.random() < 0.99 else 3)
+    for tick in range(3000):
+        now_ns += PERIOD_NS * (1 if rng.random() < 0.98 else int(rng.choice([2, 3, 7, 40])))
         for cell in (plain, quiet):
             cell.tick(now_ns)
         assert plain.shown() == quiet.shown(), f"tick {tick}"
         draw = rng.random()
-        if draw < 0.01:
+        if draw < 0.02:
             mode, column, most = MODES[int(rng.integers(len(MODES)))]
             record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
             record["axis"], record["control_mode"] = rng.integers(3), int(mode)
             record[column] = rng.uniform(-most, most)
         for cell in (plain, quiet):
             bank = cell.driver.bank
-            if draw < 0.01:
+            if draw < 0.02:
                 try:
                     bank.append(record, range(3), now_ns + 300_000, replace=bool(tick % 2))
                 except CommandError:
                     refused += 1
-            elif draw < 0.012:
+            elif draw < 0.022:
                 bank.stop([0], now_ns + 200_000)
-            elif draw < 0.014:
+            elif draw < 0.024:
                 bank.emergency_stop([1], now_ns + 200_000)
-            elif draw < 0.018:
+            elif draw < 0.028:
                 bank.reset([0, 1, 2])
             cell.driver.bank.take_events()
-    assert quiet.quiet > 2000, "most ticks are steps"
-    assert 5000 - quiet.quiet > 200, "and some are not"
+    assert quiet.quiet > 1500, "most ticks are steps"
+    assert 3000 - quiet.quiet > 50, "and some are not"
+    assert quiet.driver.blocks[2].edges[0] > 10, "beams were broken, and free again"
+
+
+@pytest.mark.parametrize("at_ms", [300, 570], ids=["as steps", "from an edge on in Python"])
+def test_turns_that_steps_make_up_for_are_shown_each_at_its_time(monkeypatch, at_ms):
+    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    cell, now_ns = Cell(True), 1_000_000_000
+    cell.tick(now_ns)
+    record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+    record["control_mode"], record["velocity"] = int(ControlMode.VELOCITY), 0.1
+    cell.driver.bank.append(record, range(3), now_ns)
+    for _ in range(at_ms):
+        now_ns += PERIOD_NS
+        cell.tick(now_ns)
+    axes, _, port = cell.driver.blocks
+    first, quiet, edges = cell.pages.number(axes), cell.quiet, int(port.edges[0])
+    now_ns += 80 * PERIOD_NS
+    cell.tick(now_ns)
+    assert (cell.quiet > quiet) == (edges == port.edges[0]) == (at_ms == 300)
+    for block in cell.driver.blocks:
+        record = cell.pages.record(block)
+        assert cell.pages.number(block) >= first + 80 // cell.driver._stride
+        words = record.words[32:]
+        stamps = [int(words[(n & record.mask) * record.slot + 1]) for n in range(first, cell.pages.number(block) + 1)]
+        assert stamps[0] == now_ns - 80 * PERIOD_NS and stamps[-1] == now_ns
+        assert max(np.diff(stamps)) <= cell.driver._stride * PERIOD_NS, "no turn is missing"
+
+
+def test_steps_that_have_no_time_leave_turns_to_later_ticks_as_the_driver_does(monkeypatch):
+    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    plain, quiet = Cell(False, make_up_ns=0), Cell(True, make_up_ns=0)
+    record, now_ns = np.zeros(1, numpy_dtype(NodeClass.AXIS)), 1_000_000_000
+    record["control_mode"], record["velocity"] = int(ControlMode.VELOCITY), 0.1
+    for tick in range(450):
+        now_ns += PERIOD_NS * (60 if tick in (300, 310) else 1)
+        for cell in (plain, quiet):
+            cell.tick(now_ns)
+            if not tick:
+                cell.driver.bank.append(record, range(3), now_ns)
+        assert plain.shown() == quiet.shown(), f"tick {tick}"
+        late_ns = now_ns - quiet.driver._last_ns
+        if tick in (300, 310):
+            assert late_ns > 50 * PERIOD_NS
+    assert late_ns == 0 and quiet.quiet > 350
 
 
 def test_idle_ticks_by_steps_show_what_those_of_the_driver_show(monkeypatch):

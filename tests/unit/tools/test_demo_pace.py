@@ -1,7 +1,9 @@
-"""The demo's ticks fit the machine: whatever the rate, the configuration stays a good one."""
+"""The demo fits the machine: whatever the rate, its configuration stays a good one, and it says what it waits for."""
 
 from __future__ import annotations
 
+import sys
+import threading
 import tomllib
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +15,7 @@ from sioms.daemon.config import parse
 from sioms.drivers.modbus.axis import ModbusAxis, ModbusAxisSettings
 from sioms.drivers.modbus.io import ModbusIo, ModbusIoSettings
 from sioms.drivers.sim.axes import SimAxes
+from sioms.tools.demo import rig
 from sioms.tools.demo.pace import RATES, paced, patient, rate_for
 
 CONFIG = files("sioms.tools.demo").joinpath("demo.toml").read_text()
@@ -47,3 +50,17 @@ def test_simulated_boards_may_be_silent_for_long_on_a_busy_machine(tmp_path: Pat
     assert ModbusAxis.describe("slide0", slide) and slide.axis[0].override["turnaround_s"] >= 1.0
     block = msgspec.convert(config.devices["io0"].settings, ModbusIoSettings)
     assert ModbusIo.describe("io0", block) and block.override["turnaround_s"] >= 1.0
+
+
+def test_a_wait_that_takes_long_or_fails_says_for_what(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with rig.waiting("something quick"):
+        pass
+    monkeypatch.setattr(rig, "SLOW_S", 0.0)
+    said = threading.Event()
+    monkeypatch.setattr("builtins.print", lambda text, flush: (sys.stdout.write(text), said.set()))
+    with pytest.raises(RuntimeError, match="wait for the marker: it was freed"), rig.waiting("the marker"):
+        assert said.wait(60.0)
+        raise OSError("it was freed")
+    assert capsys.readouterr().out == "  waiting for the marker ..."
