@@ -32,6 +32,8 @@ BENCHES: dict[str, tuple[str, str]] = {
     ),
     "pipe": ("pipes", "start of devin; devin piped into devout as a 1 kHz loop"),
     "reach": ("reach", "through a gateway: requests, readings, stops; what fails to axes halting"),
+    "clocks": ("clocks", "the stated error of a remote clock beside the truth, on simulated clocks and links"),
+    "links": ("links", "clients, links and gateways that fail, many at a time: --trials N lost clients"),
     "fleet": ("fleet", "eight cells over Zenoh: stops, starts, reconnections, strangers"),
     "drivers": (
         "drivers",

@@ -561,6 +561,7 @@ TARGETS = {
                 (link.Up.PACKET, 0, verbs.Journal("mod0").packed(3)),
                 (link.Up.PACKET, 2, b"write"),
                 (link.Up.CREDIT, 2, b""),
+                (link.Up.CREDIT, 2, b"\2"),
                 (link.Up.PING, 0, link.ping(1)),
                 (link.Up.CLOSED, 2, b""),
                 (link.Up.BYE, 0, b""),

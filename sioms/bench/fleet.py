@@ -13,7 +13,6 @@ import subprocess
 import sys
 import threading
 import time
-from pathlib import Path
 from typing import Any, Self
 
 import zenoh
@@ -29,6 +28,7 @@ from sioms.client.keys import VARIABLE
 from sioms.client.workcell import Workcell
 from sioms.client.zenoh_keys import config, endpoint
 
+from .again import connect_again
 from .figures import Bar, Report
 from .options import Options
 from .reach import fail
@@ -121,7 +121,7 @@ def bench_fleet(options: Options, report: Report) -> None:
         with Fleet(cells, "bench") as fleet:
             _stops(options, report, fleet, gateways[0])
             _starts(options, report, fleet)
-        _again(options, report, gateways[0])
+        connect_again(options, report, gateways[0])
         _strangers(options, report, gateways[0])
         _clocks(options, report, gateways[0])
     with Daemon(workcell([axes("mod0", history=HISTORY, limits=False)])) as daemon:
@@ -182,37 +182,6 @@ def _starts(options: Options, report: Report, fleet: Fleet) -> None:
     report.samples("stated: how far apart they may be", stated)
     outside = sum(skew > bound for skew, bound in zip(skews, stated, strict=True))
     report.value("starts further apart than stated", outside, bars=[Bar("value", 0)], notes=f"of {len(skews)}")
-
-
-def _owned(pid: int) -> tuple[int, float]:
-    """Return descriptors and memory [MB] of a process."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return len(os.listdir(f"/proc/{pid}/fd")), pages * os.sysconf("SC_PAGESIZE") / 1e6
-
-
-def _again(options: Options, report: Report, gateway: ZenohGateway) -> None:
-    """Connect, hold something and leave, again and again."""
-    pids = {"gateway": gateway.process.pid, "client": os.getpid()}
-    before: dict[str, tuple[int, float]] = {}
-    trials, took = options.kills(60, 1000), []
-    for trial in range(trials + 20):
-        begin = time.perf_counter_ns()
-        with Workcell(gateway.socket, "again") as cell:
-            took.append(time.perf_counter_ns() - begin)
-            with cell.open("mod0", "rw", 2.0):
-                cell.nodes()
-        if trial == 19:
-            time.sleep(1.0)
-            before = {who: _owned(pid) for who, pid in pids.items()}
-        report.progress(f"fleet: connection {trial}")
-    time.sleep(1.0)
-    report.samples("connecting over Zenoh", took, "ms")
-    for who, pid in pids.items():
-        fds, megabytes = _owned(pid)
-        report.value(
-            f"{who}: descriptors more after {trials} connections", fds - before[who][0], bars=[Bar("value", 0)],
-            notes=f"memory {megabytes - before[who][1]:+.1f} MB",
-        )  # fmt: skip
 
 
 def _strangers(options: Options, report: Report, gateway: ZenohGateway) -> None:

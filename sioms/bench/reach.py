@@ -23,6 +23,7 @@ from sioms.client.command import command
 from sioms.client.workcell import Workcell
 from sioms.protocol.link import DEFAULT_LEASE_S
 
+from .again import connect_again
 from .figures import Bar, Report
 from .options import Options
 from .watching import HISTORY, Watch, halting_ns
@@ -116,6 +117,7 @@ def bench_reach(options: Options, report: Report) -> None:
             _readings(options, report, far)
             _stops(options, report, far)
             _clocks(options, report, gateway)
+        connect_again(options, report, gateway)
         fail(options, report, daemon)
 
 

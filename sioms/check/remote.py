@@ -137,15 +137,17 @@ class Relay:
         jitter_s: how much longer at most, at random [s]; they stay in order.
         stalled: whether nothing comes through; what has been sent comes when it does again.
         doubled: whether every piece comes twice.
+        losing: whether pieces get lost: the next one of each direction, and then one of two.
 
     Concurrency: a thread of its own; attributes may be set by any.
     """
 
     def __init__(self, to_port: int) -> None:
-        self.delay_s, self.jitter_s, self.stalled, self.doubled = 0.0, 0.0, False, False
+        self.delay_s, self.jitter_s, self.stalled, self.doubled, self.losing = 0.0, 0.0, False, False, False
         self.port = free_ports()
         self._pairs: dict[socket.socket, socket.socket] = {}
         self._held: deque[tuple[float, socket.socket, bytes]] = deque()
+        self._lost: set[socket.socket] = set()
         self._to = to_port
         self._listeners = [socket.create_server(("127.0.0.1", self.port + i)) for i in (0, 1)]
         self._ending = False
@@ -172,6 +174,12 @@ class Relay:
             self._pairs.clear()
             self._held.clear()
         return now_ns
+
+    def treat(self, *, stalled: bool = False, doubled: bool = False, losing: bool = False, delay_s: float = 0.0) -> int:
+        """Treat what comes so; return from when on [ns, CLOCK_MONOTONIC]."""
+        with self._lock:
+            self.stalled, self.doubled, self.losing, self.delay_s = stalled, doubled, losing, delay_s
+            return time.monotonic_ns()
 
     def _run(self) -> None:
         while not self._ending:
@@ -208,6 +216,8 @@ class Relay:
         except OSError:
             data = b""
         other = self._pairs[sock]
+        if data and self._loses(sock):
+            return
         if data:
             way_s = self.delay_s + self.jitter_s * random.random()
             self._held.append((time.monotonic() + way_s, other, data * (2 if self.doubled else 1)))
@@ -215,3 +225,12 @@ class Relay:
         for each in (sock, other):
             self._pairs.pop(each, None)
             each.close()
+
+    def _loses(self, sock: socket.socket) -> bool:
+        if not self.losing:
+            self._lost.clear()
+            return False
+        if sock in self._lost and random.random() < 0.5:
+            return False
+        self._lost.add(sock)
+        return True

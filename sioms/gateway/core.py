@@ -21,6 +21,8 @@ from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, rep
 
 from .parts import Followed, Held, Outside, Principal, Session
 
+KEEPALIVE = verbs.Keepalive().packed()
+
 OWN_NUMBERS = 1 << 52
 """Message numbers from here on are the gateway's own requests."""
 MOST_SESSIONS = 256
@@ -31,13 +33,18 @@ MOST_WAITING = 64
 BATCH_BYTES = 48 << 10
 """Bytes of snapshots in one frame; what is older is skipped."""
 IDLE_NS = 5_000_000
-"""How often the snapshots of a node that nobody waits for are sent."""
+"""How often the snapshots of a node that nobody waits for are sent, with up to IDLE_NODES of them; more get their turns
+the more seldom, so that any number of them takes the same part of a processor.
+"""
+IDLE_NODES = 16
 STATE_NS = 50_000_000
 """How often a page's state is sent when it publishes nothing."""
 URGENT_NS = 30_000_000
 """How long after an answer snapshots are sent as they come: one of them shows what was acknowledged."""
 LOOK_NS = 500_000
 """How often to look for them."""
+TOLD = 50
+"""The driver, which runs the lease out if we cannot, knows the client's last word but for this part of the lease."""
 JOURNAL_NS = 20_000_000
 """How often events of journals are sent."""
 JOURNAL_BYTES = 48 << 10
@@ -49,7 +56,7 @@ class Gateway:
 
     Args:
         outside: sockets.
-        now: the time [ns], any monotonic clock; it is what leases run by.
+        now: the time [ns], CLOCK_MONOTONIC, as of the drivers; it is what leases run by.
         wall: tells of the wall clock.
 
     Attributes:
@@ -62,6 +69,7 @@ class Gateway:
         self._now = now
         self._wall = wall
         self._own = OWN_NUMBERS
+        self._idle_ns = IDLE_NS
         self.due_ns = 0
 
     # --- from clients ----------------------------------------------------------------------------
@@ -139,7 +147,7 @@ class Gateway:
                         followed.ahead = max(0, followed.ahead - 1)
             case Up.CREDIT:
                 if held := session.held.get(channel):
-                    held.ahead = max(0, held.ahead - 1)
+                    held.ahead = max(0, held.ahead - link.take_credit(body))
                     self._feed(session, held, now_ns)
             case Up.CLOSED:
                 if held := session.held.pop(channel, None):
@@ -163,7 +171,11 @@ class Gateway:
                 return
             held.until_ns = max(held.until_ns, stamp_ns + held.lease_ns)
         try:
-            held.node.send(packet)
+            if held.lease_ns and stamp_ns - held.told_ns > held.lease_ns // TOLD:
+                held.told_ns = stamp_ns
+                held.node.send(verbs.Heard(stamp_ns).packed())
+            if packet != KEEPALIVE:
+                held.node.send(packet)
         except OSError:
             self.driver_gone(session, handle)
 
@@ -271,8 +283,7 @@ class Gateway:
             self._follow(session, number, device, packet, fds)
             return
         self._outside.drop(fds)
-        session.urgent_ns = now_ns + URGENT_NS
-        self.due_ns = min(self.due_ns, now_ns + LOOK_NS)
+        self._answered(session, now_ns)
         self._send(session, Down.PACKET, body=packet)
 
     def _follow(self, session: Session, number: int, device: str, packet: bytes, fds: Sequence[int]) -> None:
@@ -332,9 +343,14 @@ class Gateway:
     def driver_packet(self, session: Session, handle: int, packet: bytes) -> None:
         """Take a packet of the driver behind a handle."""
         now_ns = self._now()
-        session.urgent_ns = now_ns + URGENT_NS
-        self.due_ns = min(self.due_ns, now_ns + LOOK_NS)
+        self._answered(session, now_ns)
         self._send(session, Down.PACKET, handle, packet, now_ns)
+
+    def _answered(self, session: Session, now_ns: int) -> None:
+        """Have the snapshots of a session sent as they come for a while."""
+        session.urgent_ns = now_ns + URGENT_NS
+        session.due_ns = min(session.due_ns, now_ns + LOOK_NS)
+        self.due_ns = min(self.due_ns, session.due_ns)
 
     def driver_gone(self, session: Session, handle: int) -> None:
         """The driver has ended a handle, or has gone; its page tells what is to be told."""
@@ -353,26 +369,36 @@ class Gateway:
         """Do what is due; return when the next thing may be [ns]."""
         now_ns = self._now()
         due_ns = now_ns + int(link.BEACON_S * 1e9)
+        nodes = sum(len(session.held) for session in self.sessions.values())
+        self._idle_ns = IDLE_NS * max(nodes, IDLE_NODES) // IDLE_NODES
         for session in list(self.sessions.values()):
-            if now_ns - session.heard_ns > link.GONE_S * 1e9:
-                self.end(session, errno.ETIMEDOUT, f"nothing came from the client for {link.GONE_S:g} s")
-                continue
-            owns = False
-            for held in list(session.held.values()):
-                if held.lease_ns and not held.ended and session.held:
-                    owns = True
-                    if held.until_ns < now_ns:
-                        self._run_out(session, held)
-                    else:
-                        due_ns = min(due_ns, held.until_ns + 1)
-                due_ns = min(due_ns, self._feed(session, held, now_ns))
-            if session.followed:
-                due_ns = min(due_ns, now_ns + JOURNAL_NS)
-                self._feed_journals(session)
-            beacon_ns = session.sent_ns + int((link.BEACON_S if owns else link.PING_S) * 1e9)
-            if beacon_ns <= now_ns and session.peer in self.sessions:
-                self._send(session, Down.BEACON)
+            if session.due_ns <= now_ns:
+                session.due_ns = self._attend(session, now_ns)
+            due_ns = min(due_ns, session.due_ns)
         self.due_ns = due_ns
+        return due_ns
+
+    def _attend(self, session: Session, now_ns: int) -> int:
+        """Do what is due of a session; return when the next thing may be [ns]."""
+        due_ns = now_ns + int(link.BEACON_S * 1e9)
+        if now_ns - session.heard_ns > link.GONE_S * 1e9:
+            self.end(session, errno.ETIMEDOUT, f"nothing came from the client for {link.GONE_S:g} s")
+            return due_ns
+        owns = False
+        for held in list(session.held.values()):
+            if held.lease_ns and not held.ended and session.held:
+                owns = True
+                if held.until_ns < now_ns:
+                    self._run_out(session, held)
+                else:
+                    due_ns = min(due_ns, held.until_ns + 1)
+            due_ns = min(due_ns, self._feed(session, held, now_ns))
+        if session.followed:
+            due_ns = min(due_ns, now_ns + JOURNAL_NS)
+            self._feed_journals(session)
+        beacon_ns = session.sent_ns + int((link.BEACON_S if owns else link.PING_S) * 1e9)
+        if beacon_ns <= now_ns and session.peer in self.sessions:
+            self._send(session, Down.BEACON)
         return due_ns
 
     def _run_out(self, session: Session, held: Held) -> None:
@@ -394,21 +420,32 @@ class Gateway:
         if held.ahead >= link.WINDOW or session.held.get(held.handle) is not held:  # the session may just have ended
             return now_ns + IDLE_NS
         urgent = session.urgent_ns > now_ns
-        if not (must or urgent or held.woken) and now_ns - held.sent_ns < IDLE_NS:
-            return held.sent_ns + IDLE_NS
-        page, size = held.node.page, held.node.shape.slot_size
-        head = page.head
-        alive_ns, driver, daemon, reason = page.condition()
-        changed = held.state != (driver, daemon)
-        if head > held.cursor or must or changed or held.woken or now_ns - held.sent_ns >= STATE_NS:
-            first = max(held.cursor + 1, head - held.node.shape.slots + 2, head + 1 - max(1, BATCH_BYTES // size))
-            news = [raw for raw in map(page.numbered, range(first, head + 1)) if raw is not None]
-            held.cursor, held.sent_ns, held.state = head, now_ns, (driver, daemon)
-            update = Update(alive_ns, driver, daemon, reason, held.woken, news)
-            held.woken = False
-            held.ahead += 1
+        if not (must or urgent or held.woken) and now_ns - held.sent_ns < self._idle_ns:
+            return held.sent_ns + self._idle_ns
+        condition = held.node.page.condition()
+        is_late = now_ns - held.sent_ns >= STATE_NS
+        if held.node.page.head > held.cursor or must or held.woken or is_late or held.state != condition[1:3]:
+            held.sent_ns, held.state = now_ns, condition[1:3]
+            self._send_news(session, held, condition)
+        return now_ns + (LOOK_NS if urgent else self._idle_ns)
+
+    def _send_news(self, session: Session, held: Held, condition: tuple[int, int, int, bytes]) -> None:
+        """Send the snapshots since the last ones, in as many frames as it takes and the client has confirmed."""
+        page, shape = held.node.page, held.node.shape
+        most, head = max(1, BATCH_BYTES // shape.slot_size), page.head
+        frames = link.WINDOW - held.ahead
+        first = max(held.cursor + 1, head - shape.slots + 2, head + 1 - frames * most)
+        woken, held.woken = held.woken, False
+        while session.held.get(held.handle) is held:
+            last = min(head, first + most - 1)
+            news = [raw for raw in map(page.numbered, range(first, last + 1)) if raw is not None]
+            held.cursor, held.ahead = last, held.ahead + 1
+            alive_ns, driver, daemon, reason = condition
+            update = Update(alive_ns, driver, daemon, reason, woken and last == head, news)
             self._send(session, Down.UPDATE, held.handle, update.packed())
-        return now_ns + (LOOK_NS if urgent else IDLE_NS)
+            first = last + 1
+            if first > head:
+                return
 
     def _feed_journals(self, session: Session) -> None:
         """Send what has been noted since, to a client that keeps up."""

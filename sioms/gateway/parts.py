@@ -111,6 +111,7 @@ class Held:
         node: at the daemon.
         lease_ns: longest age of the client's word, 0 = any: it owns nothing.
         until_ns: when the lease runs out.
+        told_ns: what the driver has been told of when the client last said something.
         cursor: number of the newest snapshot that has been sent.
         ahead: frames of snapshots that are not confirmed.
         sent_ns: when the last one was sent.
@@ -123,6 +124,7 @@ class Held:
     node: Node
     lease_ns: int
     until_ns: int
+    told_ns: int = 0
     cursor: int = 0
     ahead: int = 0
     sent_ns: int = 0
@@ -155,6 +157,7 @@ class Session:
         who: whose key it has; host: where it is.
         heard: number of its last frame.
         heard_ns: when that came; sent_ns: when something was last sent to it.
+        due_ns: when it is to be attended to at the latest.
         urgent_ns: until when its snapshots are sent as they come.
         line: to the daemon; None before the first packet.
         taken_in: whether the daemon has taken it for the key's.
@@ -172,6 +175,7 @@ class Session:
     heard_ns: int
     heard: int = 1
     sent_ns: int = 0
+    due_ns: int = 0
     urgent_ns: int = 0
     line: Line | None = None
     taken_in: bool = False

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 else:
     from .enumeration import IntEnum
 
-VERSION = 1
+VERSION = 2
 HEAD = Struct("<QQQQ")
 MAX_TO_GATEWAY = HEAD.size + MAX_PACKET
 """Bytes of a frame that a gateway takes."""
@@ -57,7 +57,7 @@ class Up(IntEnum):
     PACKET = 2
     """A packet for the daemon, or for the driver of a handle."""
     CREDIT = 3
-    """A set of snapshots has been taken."""
+    """Sets of snapshots or events have been taken; the body is how many, one if it is empty."""
     CLOSED = 4
     """The client has closed a handle's connection."""
     PING = 5
@@ -206,6 +206,13 @@ class Update:
             raise MalformedFrame(f"{count} snapshots of {size} bytes in {len(body)}")
         snapshots = [body[at : at + size] for at in range(start, len(body), size)]
         return cls(alive_ns, driver, daemon, body[_UPDATE.size : start], bool(wake), snapshots)
+
+
+def take_credit(body: bytes) -> int:
+    """Take the body of CREDIT apart; raises MalformedFrame."""
+    if len(body) > 1:
+        raise MalformedFrame(f"a credit of {len(body)} bytes")
+    return body[0] if body else 1
 
 
 def ping(sent_ns: int) -> bytes:

@@ -100,6 +100,7 @@ class HandleVerb(IntEnum):
     KEEPALIVE = 4
     CANCEL = 5
     PART = 6
+    HEARD = 7
 
 
 class MalformedMessage(Exception):

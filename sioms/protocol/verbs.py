@@ -399,7 +399,15 @@ class Subscribe(Message, on=ON_HANDLE, verb=HandleVerb.SUBSCRIBE, query=True):
 
 
 class Keepalive(Message, on=ON_HANDLE, verb=HandleVerb.KEEPALIVE, notice=True, query=True):
-    """Renew the lease, as every message does."""
+    """Renew the lease, as every message does but where Heard tells more."""
+
+
+class Heard(Message, on=ON_HANDLE, verb=HandleVerb.HEARD, notice=True, query=True):
+    """Renew the lease from an instant on [ns, CLOCK_MONOTONIC]; from then on nothing else does. A gateway says so: what
+    it passes on may be old.
+    """
+
+    at_ns: Integer
 
 
 class CancelOnHandle(Message, on=ON_HANDLE, verb=HandleVerb.CANCEL, query=True):

@@ -138,7 +138,9 @@ class Attachments:
             return
         except OSError:
             packet = b""
-        handle.heard_ns = time.monotonic_ns()
+        handle.came_ns = time.monotonic_ns()
+        if not handle.passed_on:
+            handle.heard_ns = handle.came_ns
         try:
             if not packet:
                 self.drop(handle)
@@ -157,6 +159,9 @@ class Attachments:
 
     def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes) -> None:
         if isinstance(message, verbs.Keepalive):
+            return
+        if isinstance(message, verbs.Heard):
+            _hear(handle, message.at_ns)
             return
         if isinstance(message, verbs.Part):
             _keep_part(handle, message)
@@ -181,7 +186,7 @@ class Attachments:
 
     def _note(self, handle: Handle, packet: bytes, errno_: int, why: str) -> None:
         """Note a command, after its answer has been sent: a client does not wait for that."""
-        self._journal.note(Note.COMMAND, handle.heard_ns, handle.node, handle.who, packet, errno_, why)
+        self._journal.note(Note.COMMAND, handle.came_ns, handle.node, handle.who, packet, errno_, why)
 
     def _value(self, handle: Handle, number: int, message: verbs.Message) -> Any:
         match message:
@@ -245,6 +250,13 @@ class Attachments:
         self._halt_all([handle])
         handle.close()
         self._tell(Detached(handle.number))
+
+
+def _hear(handle: Handle, at_ns: int) -> None:
+    """Let a lease run from when a client said something; never from later than now, nor from earlier than before."""
+    at_ns = min(at_ns, handle.came_ns)
+    handle.heard_ns = max(handle.heard_ns, at_ns) if handle.passed_on else at_ns
+    handle.passed_on = True
 
 
 def _keep_part(handle: Handle, message: verbs.Part) -> None:

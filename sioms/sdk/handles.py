@@ -73,6 +73,8 @@ class Handle:
         effects: the instant that its answers carry.
         quota: what its user may have.
         lease_ns: longest silence allowed to the client, 0 = any.
+        heard_ns: when the client last said something, as its lease knows; came_ns: when the last packet came.
+        passed_on: whether a gateway tells when the client said what it passes on.
         every: the client is woken by every n-th publication; 0 = not; -1 = when a binary edge came.
         writing: writes of axis records that are not in the buffers yet, the oldest first.
         ahead: number of a write that is to follow, and the records that have come ahead of it.
@@ -99,6 +101,8 @@ class Handle:
     heard_ns: int
     effects: Effects
     quota: Quota
+    came_ns: int = 0
+    passed_on: bool = False
     every: int = 0
     countdown: int = 0
     writes_under_way: int = 0

@@ -365,7 +365,7 @@ class Replay:
         """Serve a request on a handle."""
         assert peer.node is not None
         match message:
-            case verbs.Keepalive() | verbs.Part():
+            case verbs.Keepalive() | verbs.Heard() | verbs.Part():
                 return
             case verbs.Subscribe(every):
                 peer.node.readers.pop(peer.pipe, None)

@@ -3,13 +3,23 @@
 from __future__ import annotations
 
 import errno
+import itertools
 import random
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import pytest
 
-from sioms.gateway.core import JOURNAL_BYTES, MOST_OF_A_KEY, MOST_SESSIONS, OWN_NUMBERS, Gateway
+from sioms.gateway.core import (
+    IDLE_NODES,
+    JOURNAL_BYTES,
+    JOURNAL_NS,
+    MOST_OF_A_KEY,
+    MOST_SESSIONS,
+    OWN_NUMBERS,
+    TOLD,
+    Gateway,
+)
 from sioms.gateway.parts import Principal, Session
 from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
@@ -22,6 +32,8 @@ from sioms.protocol.records import READ_SIZE
 
 KATE, BEN = Principal("kate", ("ops",)), Principal("ben")
 MS = 1_000_000
+HEARD = verbs.Heard(0).packed()[:2]
+WRITE = verbs.Write(0, 0.0, b"").packed(3)
 
 
 class Node:
@@ -159,6 +171,16 @@ class World:
         return [kind for kind, *_ in self.sent[peer]]
 
 
+def said(node: Node) -> list[bytes]:
+    """Return what a driver has got of its client, without what the gateway says of it."""
+    return [packet for packet in node.got if not packet.startswith(HEARD)]
+
+
+def heard(node: Node) -> list[int]:
+    """Return when the client said what its driver has got, as the gateway tells."""
+    return [decode(packet)[2] for packet in node.got if packet.startswith(HEARD)]
+
+
 @pytest.fixture
 def world() -> World:
     return World()
@@ -247,12 +269,33 @@ def test_a_lease_runs_from_what_the_client_had_been_told_so_a_late_burst_renews_
         world.now_ns += 10 * MS
         world.gateway.tick()
     world.frame(b"a", Up.PACKET, 5, b"write 1", stamp_ns=told_ns)
-    assert node.got == [b"write 1"]
+    assert said(node) == [b"write 1"]
     world.now_ns = told_ns + int(link.DEFAULT_LEASE_S * 1e9) + 1
     world.frame(b"a", Up.PACKET, 5, b"write 2", stamp_ns=told_ns)
-    assert node.got == [b"write 1"] and node.state == "ended", "not a nanosecond longer, and no late write"
+    assert said(node) == [b"write 1"] and node.state == "ended", "not a nanosecond longer, and no late write"
     world.frame(b"a", Up.PACKET, 5, b"write 3")
-    assert node.got == [b"write 1"], "nothing resumes"
+    assert said(node) == [b"write 1"], "nothing resumes"
+
+
+def test_the_driver_is_told_how_old_its_clients_word_is_so_that_a_gateway_that_falls_asleep_extends_nothing(
+    world: World,
+) -> None:
+    world.begin(b"a")
+    node = world.open(b"a", 5)
+    told_ns = world.told(b"a")
+    world.now_ns += 190 * MS
+    world.frame(b"a", Up.PACKET, 5, WRITE, stamp_ns=told_ns)
+    assert node.got == [verbs.Heard(told_ns).packed(), WRITE], "the lease of the driver began 190 ms ago"
+    for _ in range(100):
+        world.now_ns += MS
+        world.gateway.tick()
+        for packet in (WRITE, verbs.Keepalive().packed()):
+            world.frame(b"a", Up.PACKET, 5, packet)
+    since = [told_ns, *heard(node)[1:]]
+    step_ns = int(link.DEFAULT_LEASE_S * 1e9) // TOLD
+    assert all(step_ns < after - before <= 30 * MS for before, after in itertools.pairwise(since[1:]))
+    assert world.now_ns - since[-1] < 30 * MS and len(since) < 40, "often enough, and not with each packet"
+    assert set(said(node)) == {WRITE}, "nothing that renews from now on"
 
 
 def test_what_comes_late_renews_a_lease_from_when_its_client_was_told_the_time(world: World) -> None:
@@ -302,10 +345,10 @@ def test_a_frame_is_taken_once_and_in_order(world: World) -> None:
     world.frame(b"a", Up.PACKET, 5, b"before", number=2)
     world.numbers[b"a"] = number
     world.frame(b"a", Up.PACKET, 5, b"two")
-    assert node.got == [b"one", b"two"]
+    assert said(node) == [b"one", b"two"]
     world.frame(b"a", Up.PACKET, 5, b"four", number=number + 3)
     assert b"a" not in world.gateway.sessions and node.state == "closed", "what is missing may have been a stop"
-    assert node.got == [b"one", b"two"]
+    assert said(node) == [b"one", b"two"]
 
 
 def test_frames_of_before_a_cut_begin_nothing(world: World) -> None:
@@ -443,6 +486,46 @@ def test_a_reader_that_confirms_gets_every_snapshot_and_one_that_does_not_gets_f
     assert world.kinds(b"dead").count(Down.UPDATE) == link.WINDOW
 
 
+def test_many_nodes_that_nobody_waits_for_take_no_more_than_a_few(world: World) -> None:
+    def frames(sessions: int) -> float:
+        first = len(world.gateway.sessions)
+        for i in range(first, sessions):
+            world.begin(b"%d" % i, Principal(f"key{i}"))
+            world.open(b"%d" % i, i, read_only=True)
+        count, began_ns = 0, world.now_ns
+        while world.now_ns < began_ns + 500 * MS:
+            world.now_ns += MS
+            for node in world.nodes.values():
+                node.publish(world.now_ns)
+            world.gateway.tick()
+            for i in range(sessions):
+                for _ in range(world.kinds(b"%d" % i).count(Down.UPDATE)):
+                    world.frame(b"%d" % i, Up.CREDIT, i, who=Principal(f"key{i}"), stamp_ns=0)
+                    count += 1
+                world.sent[b"%d" % i].clear()
+        return count / 0.5
+
+    few, many = frames(IDLE_NODES), frames(6 * IDLE_NODES)
+    assert few == pytest.approx(IDLE_NODES * 200, rel=0.2) and many < 1.3 * few
+
+
+def test_of_large_snapshots_as_many_go_at_once_as_the_client_confirms(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    world.begin(b"a")
+    node = world.open(b"a", 5, read_only=True)
+    since = len(world.sent[b"a"])
+    monkeypatch.setattr("sioms.gateway.core.BATCH_BYTES", 2 * node.shape.slot_size)
+    for _ in range(5):
+        node.publish(world.now_ns)
+    world.gateway.woken(world.session(b"a"), 5)
+    bodies = [body for kind, *_, body in world.sent[b"a"][since:] if kind == Down.UPDATE]
+    assert len(bodies) == 3
+    updates = [Update.take(body, node.shape.slot_size) for body in bodies]
+    assert [len(update.snapshots) for update in updates] == [2, 2, 1]
+    assert [update.wake for update in updates] == [False, False, True], "who is woken finds them all"
+
+
 def test_who_waits_for_news_or_has_been_answered_gets_them_at_once(world: World) -> None:
     world.begin(b"a")
     node = world.open(b"a", 5)
@@ -547,13 +630,14 @@ def test_who_does_not_confirm_events_gets_four_frames_and_hears_of_what_was_over
     journal = follow(world, b"a")
     since = len(world.sent[b"a"])
     for _ in range(300):
-        world.now_ns += MS
+        world.now_ns += JOURNAL_NS
         journal.writer.note(Note.CLOSED, world.now_ns, "n" * 100, "eva")
         world.frame(b"a", Up.PING, body=link.ping(1))
         world.gateway.tick()
     assert events(world, b"a", since) == [4, 5, 6, 7], "of who does not confirm nothing more is read"
     for _ in range(4):
         world.frame(b"a", Up.CREDIT, link.JOURNAL | 7)
+    world.now_ns += JOURNAL_NS
     world.gateway.tick()
     got = events(world, b"a", since)
     assert got[4] > 8 and got[4:] == list(range(got[4], 304)), "the newest, whose numbers tell what is missing"
@@ -575,6 +659,7 @@ def test_events_come_in_frames_of_bounded_size(world: World) -> None:
     for _ in range(40):
         journal.writer.note(Note.COMMAND, 7, "mod0", "eva", bytes(10_000), 0, "")
     for _ in range(12):
+        world.now_ns += JOURNAL_NS
         world.gateway.tick()
         world.frame(b"a", Up.CREDIT, link.JOURNAL | 7)
     sizes = [len(body) for kind, *_, body in world.sent[b"a"][since:] if kind == Down.EVENTS]

@@ -6,6 +6,7 @@ import random
 
 import pytest
 
+from sioms.bench.clocks import trial
 from sioms.protocol import link
 from sioms.protocol.clock import UNKNOWN_NS, Clock, Offset, Wall
 from sioms.protocol.flags import NodeClass, PageState
@@ -92,6 +93,14 @@ def test_the_stated_error_holds_the_truth_however_the_link_delays() -> None:
             now = back + rng.randrange(10**9)
             assert abs(offset.ns - (there(now) - now)) <= offset.error_ns(now) + 1
         assert offset.restarts == 0 and offset.error_ns(now) < 1_000_000
+
+
+@pytest.mark.parametrize(("jumps", "most"), [(0.0, 0), (0.1, 4)])
+def test_the_stated_error_holds_the_truth_of_clocks_that_wander_over_links_with_bursts(jumps: float, most: int) -> None:
+    chance = random.Random(7)
+    found = [trial(chance, jumps) for _ in range(400)]
+    assert sum(off_ns > error_ns for off_ns, error_ns in found) <= most
+    assert sorted(error_ns for _, error_ns in found)[200] < 50_000_000
 
 
 def test_a_clock_that_jumped_is_known_anew() -> None:

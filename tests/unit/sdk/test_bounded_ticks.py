@@ -9,6 +9,7 @@ from own_writes_rig import CLOCK, World, own_time
 from sioms.drivers.sim.axes import SimAxes
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.records import AXIS_WRITE, WRITE
+from sioms.protocol.verbs import Heard
 
 
 @pytest.fixture
@@ -94,3 +95,30 @@ def test_a_long_tick_leaves_less_time_for_clients_work_and_one_in_four_always_so
         for runtime.tick in range(4):
             left[share].append(round((runtime._spare_until(ticked_ns) - ticked_ns) / period_ns, 3))
     assert left == {0.1: [0.25] * 4, 0.4: [0.25, 0.1, 0.1, 0.1], 0.9: [0.25, -0.4, -0.4, -0.4]}
+
+
+def test_what_a_gateway_passes_on_renews_from_when_it_was_said(world: World) -> None:
+    lease_ns = 50_000_000
+    client = world.open(0, [0], exclusive=True)
+    handle = world.runtime.clients.handles[client.node.handle]
+    handle.lease_ns = lease_ns
+    world.runtime.clients._leased.append(handle)
+    said_ns = CLOCK.now_ns
+    CLOCK.now_ns += lease_ns - 10_000_000
+    client.channel.notice(Heard(said_ns).packed())
+    world.serve(client)
+    client.write(jog(), replace=True)  # late, but within the lease: it is carried out, and extends nothing
+    world.serve(client)
+    assert world.runtime.clients.until_ns() == said_ns + lease_ns and handle.number in world.runtime.clients.handles
+    for at_ns in (said_ns - 1, CLOCK.now_ns + 1_000_000_000):
+        client.channel.notice(Heard(at_ns).packed())
+        world.serve(client)
+    assert handle.heard_ns <= CLOCK.now_ns, "not later than now, whatever is said"
+    client.channel.notice(Heard(said_ns).packed())
+    world.serve(client)
+    assert handle.heard_ns > said_ns, "nor earlier than before"
+    CLOCK.now_ns += lease_ns + 1
+    client.channel.keepalive()
+    world.serve(client)
+    world.tick()
+    assert handle.number not in world.runtime.clients.handles
