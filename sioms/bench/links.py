@@ -227,7 +227,7 @@ def _set_going(scene: _Scene, nodes: Mapping[str, Any], address: str) -> dict[st
     for name in [f"{device}.a{number}" for device in DEVICES for number in range(AXES)]:
         owners[name] = scene.daemon.fork(partial(_owner, address, name, scene.chance.getrandbits(32), scene.begun))
     for node in nodes.values():
-        wait_for(partial(_all_go, node), 60.0, f"{node.name} to cruise")
+        wait_for(partial(_all_go, node), 120.0, f"{node.name} to cruise")
     return owners
 
 

@@ -49,7 +49,7 @@ def _keeping(lease: float = 0.0) -> str:
 
 
 def test_the_library_is_the_same_and_others_hear_whose_it_is(remote: sioms.Workcell, cell: sioms.Workcell) -> None:
-    with remote.open("mod0", "rw") as arm:
+    with remote.open("mod0", "rw", lease=2.0) as arm:
         start = arm.read()
         for axis in (0, 1):
             arm.move(0.02 if start.position[axis] < 0.01 else 0.0, axis)

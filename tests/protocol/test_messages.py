@@ -73,6 +73,7 @@ from sioms.protocol.verbs import (
     Close,
     EmergencyStop,
     FreeMarker,
+    Heard,
     Hello,
     Info,
     Ioctl,
@@ -150,6 +151,7 @@ RECORDED: list[tuple[Message, str]] = [
     ),
     (Subscribe(-1), "930305ff"),
     (Keepalive(), "920405"),
+    (Heard(7), "93070507"),
     (CancelOnHandle(5), "93050505"),
     (Part(9, b"\x03"), "94060509c40103"),
     (

@@ -308,7 +308,7 @@ def test_what_comes_late_renews_a_lease_from_when_its_client_was_told_the_time(w
     assert node.state == "open"
     world.now_ns = told_ns + lease_ns + 1
     world.gateway.tick()
-    assert node.got == [b"write 1"] and node.state == "ended"
+    assert said(node) == [b"write 1"] and node.state == "ended"
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.4, 0.999, 1.0, 7.0])
