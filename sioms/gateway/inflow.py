@@ -44,10 +44,13 @@ class Inflow:
         """Return the connections on which more has piled up than may; they have been shut down."""
         sockets, ahead, found = dict[int, int](), dict[int, int](), []
         for fd in map(int, os.listdir("/proc/self/fd")):
-            came = received(fd)
+            try:
+                came, inode = received(fd), os.fstat(fd).st_ino
+            except OSError:  # a thread of ZeroMQ has closed it meanwhile
+                continue
             if came < 0:
                 continue
-            sockets[fd] = os.fstat(fd).st_ino
+            sockets[fd] = inode
             if self._sockets.get(fd) != sockets[fd]:
                 self._taken[fd] = came  # of a new one nothing has piled up
             self._taken[fd] = min(self._taken.get(fd, 0), came)

@@ -81,3 +81,17 @@ def test_a_descriptor_that_is_another_connection_begins_anew(pairs: list[Pair]) 
     assert inflow.received(fd) == 90_000
     with open(os.devnull) as file:
         assert inflow.received(file.fileno()) == -1
+
+
+def test_a_connection_that_is_closed_while_it_is_looked_at_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    closed = os.dup(0)
+    received = inflow.received
+
+    def closes(fd: int) -> int:
+        if fd != closed:
+            return received(fd)
+        os.close(fd)  # as a thread of ZeroMQ does when a peer leaves
+        return 5
+
+    monkeypatch.setattr(inflow, "received", closes)
+    assert Inflow().look() == []
