@@ -37,6 +37,9 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+PATIENCE_S = 60.0
+"""Longest wait for a process that starts or ends [s]: on two cores at a load of 20 a workcell takes 27 s."""
+
 MARKERS = {
     "slow": "takes more than five seconds",
     "root": "needs the rights of root; skipped without",
@@ -117,7 +120,7 @@ class Running:
             self._ended = True
             self._news.notify_all()
 
-    def wait_line(self, pattern: str, timeout_s: float = 20.0) -> re.Match[str]:
+    def wait_line(self, pattern: str, timeout_s: float = PATIENCE_S) -> re.Match[str]:
         """Return the first match of a regular expression in any line, old or new.
 
         Raises:
@@ -137,7 +140,7 @@ class Running:
                     raise AssertionError(self._told(f"no line matched {pattern!r} before {why}"))
                 self._news.wait(left)
 
-    def wait_exit(self, timeout_s: float = 20.0) -> int:
+    def wait_exit(self, timeout_s: float = PATIENCE_S) -> int:
         """Return the exit status (minus the signal's number after a kill), with all output collected."""
         try:
             status = self.process.wait(timeout_s)

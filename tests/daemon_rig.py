@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from conftest import Running
+from conftest import PATIENCE_S, Running
 
 import sioms
 
@@ -148,7 +148,7 @@ class Daemon:
             }  # between two processes of a reload
             return next((d for d in cell.status()["devices"] if d["name"] == name), absent)
 
-    def wait_up(self, name: str, generation: int = 1, timeout_s: float = 20.0) -> dict[str, Any]:
+    def wait_up(self, name: str, generation: int = 1, timeout_s: float = PATIENCE_S) -> dict[str, Any]:
         """Wait until a device is up in at least this generation with a good link."""
 
         def up() -> dict[str, Any] | None:
@@ -163,7 +163,7 @@ class Daemon:
         children = Path(f"/proc/{self.pid}/task/{self.pid}/children").read_text().split()
         return next(int(c) for c in children if "fork_server" in Path(f"/proc/{c}/cmdline").read_text())
 
-    def said(self, pattern: str, timeout_s: float = 20.0) -> str:
+    def said(self, pattern: str, timeout_s: float = PATIENCE_S) -> str:
         """Wait for a line of its log; return it."""
         return self.running.wait_line(pattern, timeout_s).string
 
@@ -180,7 +180,7 @@ class Daemon:
     def terminate(self) -> int:
         """Ask it to end; return its status."""
         self.running.signal(signal.SIGTERM)
-        return self.running.wait_exit(20.0)
+        return self.running.wait_exit(PATIENCE_S)
 
     def end(self) -> None:
         """End it and all that it started, whatever state it is in."""
@@ -240,7 +240,7 @@ class Client:
         """Of the process."""
         return self.running.process.pid
 
-    def wait_line(self, pattern: str, timeout_s: float = 20.0) -> Any:
+    def wait_line(self, pattern: str, timeout_s: float = PATIENCE_S) -> Any:
         """Return the match of a line."""
         return self.running.wait_line(pattern, timeout_s)
 

@@ -57,9 +57,10 @@ class Workcells:
         """Return the daemon of a group, started if another was at work; None ends what is at work."""
         if number != self._number:
             self._stack.close()
-            self._stack = ExitStack()
-            self._number = number
-            self._daemon = None if number is None else self._stack.enter_context(at_work(GROUPS[number]))
+            self._stack, self._number, self._daemon = ExitStack(), None, None
+            if number is not None:
+                self._daemon = self._stack.enter_context(at_work(GROUPS[number]))
+            self._number = number  # of one that did not come up the next test tries again
         return self._daemon
 
 
