@@ -29,6 +29,7 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import TIMES, Options, Prepared
+from sioms.reconcile.rate import SAMPLE_TIME, instead, remark
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
@@ -36,7 +37,7 @@ from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MOSTLY, QUIET, REFUTED, UNEXPLAINED
 from sioms.reconcile.timed import as_recorded
-from sioms.reconcile.verdict import Gap, Outcome, Place
+from sioms.reconcile.verdict import Candidate, Gap, NamedEffect, Outcome, Place
 
 HELD = (
     "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the "
@@ -44,6 +45,12 @@ HELD = (
 )
 #: Steps of the last fit.
 LAST = 12
+#: The effect that another sample time looks like.
+PAYLOAD = "payload"
+#: Why an effect of the model is no finding.
+REFUSED_FREE = "the model with it does not move as the machine did"
+REFUSED_BEYOND = "too much remains beside it for a part to be told"
+REFUSED_BOUND = "a number of it is at the end of what it can be: it stands for something else"
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +92,10 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
-    missing = bool(terms) or bool(leaning) or disturbance or ratio > LARGE or odd or bool(judged.refusals)
-    said = outcome(bool(named), missing, bool(open_rivals))
+    beyond = ratio > LARGE
+    missing = bool(terms) or bool(leaning) or disturbance or beyond or odd or bool(judged.refusals)
+    blindly = ready.blind and any(e.name == PAYLOAD for e in named)
+    said = outcome(bool(named), missing, bool(open_rivals) or blindly)
     gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)
     notes = [*ready.notes, *judged.notes, *judged.refusals]
     notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
@@ -94,16 +103,24 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes.append(HELD.format(0.5e3 * fit.model.sample_time_s))
     if disturbance:
         notes.append(_of_bursts(ready.problem, found.fit, burst))
-    elif ratio > LARGE:
+    elif beyond:
         notes.append(_of_much(ratio, s.share))
+    if ready.blind:
+        notes.insert(0, remark(nominal))
+    tried = refused(named, leaning, bool(judged.refusals), beyond)
+    found_here = [e for e in named if e.name not in {c.name for c in tried}]
+    others_said = _alternatives(fit.model, found_here, open_rivals, blindly) if said is Outcome.AMBIGUOUS else ()
+    if blindly:
+        found_here = [_rated(e, nominal, fit.model) for e in found_here]
     open_now = open_rivals if said is Outcome.AMBIGUOUS else []
     places, spectrum, traces = _pictures(ready, nominal, found.fit.model, o, rng)
     return AxisVerdict(
         outcome=said,
         nominal=nominal,
         model=fit.model,
-        effects=tuple(named),
-        alternatives=tuple(alternative(r, fit.model.effects) for r in open_now),
+        effects=tuple(found_here),
+        candidates=tried,
+        alternatives=others_said,
         symbolic=tuple(terms),
         gaps=gaps,
         ladder=found.ladder,
@@ -125,6 +142,34 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         rejected=s.rejected,
         others=tuple(q.fit.model.effects for q in open_now),
     )
+
+
+def refused(
+    named: Sequence[NamedEffect], leaning: Sequence[NamedEffect], freely_refused: bool, beyond: bool
+) -> tuple[Candidate, ...]:
+    """Return what is in the model without being found: all of it where the model is refused, else what leans."""
+    if freely_refused:
+        return tuple(Candidate(e.name, e.title, REFUSED_FREE) for e in named)
+    if beyond:
+        return tuple(Candidate(e.name, e.title, REFUSED_BEYOND) for e in named)
+    return tuple(Candidate(e.name, e.title, REFUSED_BOUND) for e in leaning)
+
+
+def _alternatives(
+    model: AxisModel, found: Sequence[NamedEffect], rivals: Sequence[Rival], blindly: bool
+) -> tuple[tuple[str, ...], ...]:
+    """Return the sets of names that explain as well; a payload may be another sample time where nothing tells that."""
+    sets = [alternative(r, model.effects) for r in rivals]
+    if blindly:
+        sets.append(tuple(SAMPLE_TIME if e.name == PAYLOAD else e.name for e in found))
+    return tuple(sets)
+
+
+def _rated(e: NamedEffect, nominal: AxisModel, model: AxisModel) -> NamedEffect:
+    """Tell beside a payload which sample time would do the same."""
+    if e.name != PAYLOAD:
+        return e
+    return replace(e, evidence=(*e.evidence, instead(nominal, model.effects[PAYLOAD]["J_extra"])))
 
 
 def _gaps(s: Searched, states: Sequence[State], rng: np.random.Generator) -> tuple[tuple[Gap, ...], Judgement]:

@@ -7,7 +7,7 @@ switchable by ``on``.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 from sioms.reconcile.effects import known
@@ -113,8 +113,12 @@ def _controller(table: Mapping[str, Any], where: str) -> Controller:
     return Controller(**numbers, velocity_mean=truth(table, "velocity_mean", of_controller, False))
 
 
-def write_model(model: AxisModel) -> str:
-    """Write a model as TOML, every effect switchable by ``on``."""
+def write_model(model: AxisModel, off: Container[str] = ()) -> str:
+    """Write a model as TOML, every effect switchable by ``on``.
+
+    Args:
+        off: effects that are written switched off.
+    """
     lines = ["[axis]", f'name = "{model.name}"', f'kind = "{"rotary" if model.rotary else "linear"}"']
     for key in AXIS_NUMBERS:
         lines.append(f"{key} = {getattr(model, key)!r}")
@@ -125,7 +129,7 @@ def write_model(model: AxisModel) -> str:
     for name, values in model.effects.items():
         effect = known()[name]
         lines += ["", f"# {effect.title}: {effect.equation}"]
-        lines += [f"[effects.{name}]", "on = true"]
+        lines += [f"[effects.{name}]", f"on = {_toml(name not in off)}"]
         units = {p.symbol: f"{model.unit(p)}, {p.text}" for p in effect.parameters}
         lines += [f"{k} = {float(v)!r}  # {units[k]}" for k, v in values.items()]
     return "\n".join(lines) + "\n"

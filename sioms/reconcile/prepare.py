@@ -17,6 +17,7 @@ from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
+from sioms.reconcile.rate import trusted_blindly
 from sioms.reconcile.records import Session
 from sioms.reconcile.sampling import Sampling, read_as, sampling_of, trusted
 from sioms.reconcile.scale import check_scale
@@ -66,6 +67,7 @@ class Prepared:
         points: the force is known at the rows of the log only.
         timed: forces that keep their own time, by now among the known ones of the problems' records.
         apart: the final statement is made on whole records of their own.
+        blind: nothing in the records tells their sample time.
     """
 
     nominal: AxisModel
@@ -79,6 +81,7 @@ class Prepared:
     points: bool = False
     timed: tuple[Timed, ...] = ()
     apart: bool = False
+    blind: bool = False
 
     def beside(self, force: Timed) -> Prepared:
         """Take a force in time for known; records of their own have had none of it."""
@@ -92,6 +95,10 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     Raises:
         BadInputError: the data cannot be used.
     """
+    return replace(_prepared(session, nominal, o), blind=trusted_blindly(session, nominal))
+
+
+def _prepared(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     session, notes = on_grid(session, nominal.sample_time_s)
     session, left_out = usable(session, searched(session), nominal)
     notes += left_out
@@ -121,8 +128,8 @@ def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options)
     if sampling is None:
         return None
     notes = [*ready.notes, sampling.text(model.sample_time_s)]
-    ready = _read(problem.session, ready.nominal, notes, o, sampling)
-    return replace(ready, names=tuple(n for n in ready.names if n not in TIMES))
+    other = _read(problem.session, ready.nominal, notes, o, sampling)
+    return replace(other, names=tuple(n for n in other.names if n not in TIMES), blind=ready.blind)
 
 
 def _read(session: Session, nominal: AxisModel, notes: Sequence[str], o: Options, sampling: Sampling) -> Prepared:

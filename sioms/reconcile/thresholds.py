@@ -61,6 +61,11 @@ UNLIKE = 3.5
 """Records of one axis show inertias that differ by less than this factor. Forty axes: 2.8 under a drive that saturates,
 1.3 else; every second row lost in one of them makes 4 (0562)."""
 
+OTHER_RATE, LAW_TELLS, LAW_LEAST = 1.1, 3.0, 1e-3
+"""A controller whose law holds the sample time tells it where it leaves so many times more of the force, and of more
+than the last share of it, at a sample time that is the first times the stated one. Forty axes, whose laws hardly hold
+it: 1.1 at most; a law with a derivative 50 and more (0661)."""
+
 # --- when an effect counts
 
 GAIN = 0.05

@@ -13,7 +13,8 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.ladder import Step
 
 __all__ = [
-    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Estimate", "Gap", "NamedEffect", "Outcome", "Place", "Verdict", "apart",
+    "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Candidate", "Estimate", "Gap", "NamedEffect", "Outcome", "Place",
+    "Verdict", "apart",
 ]  # fmt: skip
 
 
@@ -65,6 +66,15 @@ class NamedEffect:
     evidence: tuple[str, ...]
     ruled_out: dict[str, str] = field(default_factory=dict)
     open: dict[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Candidate:
+    """An effect of a model that was refused: what was tried, and no finding. It has no numbers for that reason."""
+
+    name: str
+    title: str
+    why: str
 
 
 def apart(effects: Iterable[NamedEffect]) -> tuple[list[NamedEffect], list[NamedEffect]]:
@@ -150,6 +160,7 @@ class Verdict:
         pairs: effects that look the same in these records, with the share they have in common.
         places: where the nominal model disagreed.
         ratio: residual of the final model in units of what is expected.
+        candidates: effects of ``model`` that are no findings, as the model, or they in it, were refused.
     """
 
     outcome: Outcome
@@ -170,6 +181,7 @@ class Verdict:
     samples: int
     notes: tuple[str, ...]
     rejected: tuple[str, ...] = ()
+    candidates: tuple[Candidate, ...] = ()
 
     @property
     def experiment(self) -> Decides | None:

@@ -103,7 +103,7 @@ def _live_axis(args: Args, folder: Path, say: Say) -> tuple[Any, float]:
 def _write_axis(args: Args, verdict: Any) -> None:
     from sioms.reconcile.model_file import write_model
 
-    write_whole(args.out / "model.toml", write_model(verdict.model))
+    write_whole(args.out / "model.toml", write_model(verdict.model, {c.name for c in verdict.candidates}))
     if verdict.experiment is not None:
         lines = ["command", *(f"{x:.9g}" for x in verdict.experiment.command)]
         write_whole(args.out / "experiment.csv", "\n".join(lines) + "\n")

@@ -47,6 +47,13 @@ def page(v: Verdict, seconds: float) -> Page:
         p.head("What was missing")
         _what(p, v)
         show("each")
+    if v.candidates:
+        p.head("What was tried and refused")
+        p.text(
+            "These are no findings. The search came to them, and the model with them does not hold, so they have no "
+            "numbers here; model.toml has them switched off."
+        )
+        p.items(f"{c.title}: {c.why}" for c in v.candidates)
     p.head("How far the gap shrank")
     _gaps(p, v)
     show("gaps", "curves")
@@ -55,7 +62,7 @@ def page(v: Verdict, seconds: float) -> Page:
         p.lesser(e.title)
         p.items(_why(e, v))
     if not v.effects and not v.symbolic:
-        p.text("No effect was identified.")
+        p.text("Nothing is named, so there is nothing to believe." if v.candidates else "No effect was identified.")
     _next(p, v)
     p.head("How it was found")
     _ladder(p, v)
@@ -75,7 +82,8 @@ def _opening(p: Page, v: Verdict) -> None:
         lines.append(f"{v.notes[-1][0].upper()}{v.notes[-1][1:]}")
     if where := places(v, 2):
         lines.append(f"Of the disagreement goes {where}")
-    lines.append(f"On data that took no part, {shrunk(v.speaking)}")
+    by = ", by the model that is refused" if v.candidates and not v.effects else ""
+    lines.append(f"On data that took no part{by}, {shrunk(v.speaking)}")
     p.box(COLOURS[v.outcome], lines)
 
 
@@ -94,7 +102,7 @@ def _what(p: Page, v: Verdict) -> None:
     rows: list[Sequence[object]] = []
     every = []
     for e in (*v.effects, *v.symbolic):
-        label, equation = e.title if e in v.effects else "nameless term", e.equation
+        label, equation = e.title if e in v.effects else "without a name", e.equation
         for mine in groups(e).values():
             rows.append((label, equation, *_quantity(mine)))
             label = equation = ""

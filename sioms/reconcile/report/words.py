@@ -25,7 +25,9 @@ CHANCE = 0.05
 def headline(v: Verdict) -> str:
     """One sentence."""
     if v.outcome is Outcome.UNEXPLAINED and v.effects:
-        return "Found part of what the model lacks; something remains that no effect of the library explains."
+        return "Found part of what the model lacks; beside it something remains that no effect of the library explains."
+    if v.candidates:
+        return "Something is missing, and no model that was tried holds: nothing is named."
     return HEAD[v.outcome]
 
 
@@ -46,7 +48,7 @@ def summary(v: Verdict, out: str) -> list[str]:
     """Say the verdict in at most ten lines."""
     lines = [f"verdict: {v.outcome.value} - {headline(v)}"]
     lines += ["  " + in_words(e) for e in v.effects[:4]]
-    lines += [f"  unexplained part looks like {in_words(e)}" for e in v.symbolic[:2]]
+    lines += [f"  the unexplained part, without a name, follows {in_words(e)}" for e in v.symbolic[:2]]
     more = []
     if v.alternatives:
         sets = [[e.name for e in v.effects], *v.alternatives]
@@ -60,7 +62,10 @@ def summary(v: Verdict, out: str) -> list[str]:
         ruled = ", ".join(v.effects[0].ruled_out)
         more.append(f"why: {v.effects[0].evidence[-1]}" + (f"; ruled out: {ruled}" if ruled else ""))
     more += [f"note: {note}" for note in reversed(v.notes)]
-    last = [f"gap on untouched data, {shrunk(v.speaking)}", f"report: {out}"]
+    if v.candidates:
+        more.append(f"tried and refused, not found: {', '.join(c.title for c in v.candidates)}")
+    of = "gap on untouched data" if not v.candidates or v.effects else "gap on untouched data, by the refused model"
+    last = [f"{of}, {shrunk(v.speaking)}", f"report: {out}"]
     return [*lines, *more[: LINES - len(lines) - len(last)], *last]
 
 
@@ -125,6 +130,7 @@ def as_json(v: Verdict, seconds: float) -> str:
         "separation_in_noise": v.experiment.separation if v.experiment else None,
         "details": [_effect(e) for e in v.effects],
         "symbolic": [_effect(e) for e in v.symbolic],
+        "refused_candidates": [{"name": c.name, "title": c.title, "why": c.why} for c in v.candidates],
         "located": [{"variable": p.variable, "explained": p.explained, "p": p.p} for p in v.places],
         "smoother_share": v.smoother_share,
         "burst_share": v.burst_share,

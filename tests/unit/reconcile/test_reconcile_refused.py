@@ -1,0 +1,87 @@
+"""What a refused model is made of is told as tried, not as found: in words, on the page, in JSON and in model.toml."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+from sioms.reconcile.axis import analyse
+from sioms.reconcile.axis_verdict import AxisVerdict
+from sioms.reconcile.conclude import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, refused
+from sioms.reconcile.files.axis import read_data, read_model
+from sioms.reconcile.model_file import parse_model, write_model
+from sioms.reconcile.prepare import Options
+from sioms.reconcile.records import Session
+from sioms.reconcile.report.page import page
+from sioms.reconcile.report.words import as_json, summary
+from sioms.reconcile.verdict import Candidate, NamedEffect, Outcome
+
+AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
+WEAK = Candidate("stribeck", "Stribeck friction (low-speed drop)", REFUSED_FREE)
+
+
+def effect(name: str) -> NamedEffect:
+    return NamedEffect(name, name.title(), "", "", (), 0.5, 9.0, None, ())
+
+
+@pytest.mark.parametrize(
+    ("freely", "beyond", "names", "why"),
+    [
+        (True, False, ["coulomb", "spring"], REFUSED_FREE),
+        (False, True, ["coulomb", "spring"], REFUSED_BEYOND),
+        (False, False, ["spring"], REFUSED_BOUND),
+    ],
+)
+def test_a_refused_model_makes_candidates_of_all_its_effects(
+    freely: bool, beyond: bool, names: list[str], why: str
+) -> None:
+    named = [effect("coulomb"), effect("spring")]
+    found = refused(named, named[1:], freely, beyond)
+    assert [c.name for c in found] == names
+    assert {c.why for c in found} == {why}
+    assert refused(named, [], False, False) == ()
+
+
+@cache
+def verdict() -> AxisVerdict:
+    """Return the verdict on a model that has been refused though the search came to friction."""
+    model = read_model(AXES / "s05" / "nominal.json")
+    session = read_data(AXES / "s05", model)
+    short = Session(tuple(r.cut(0, 1500) for r in session.records[:2]))
+    found = analyse(short, model, Options(pictures=False))
+    level = model.rated_force
+    tried = model.with_effect("stribeck", {"Fc": 0.1 * level, "Fs": 0.2 * level, "vs": 0.01})
+    return replace(found, outcome=Outcome.UNEXPLAINED, model=tried, effects=(), symbolic=(), candidates=(WEAK,))
+
+
+def test_the_terminal_names_nothing_and_says_what_was_refused() -> None:
+    lines = summary(verdict(), "report.html")
+    assert lines[0].endswith("Something is missing, and no model that was tried holds: nothing is named.")
+    assert "tried and refused, not found: Stribeck friction (low-speed drop)" in lines
+    assert any(line.startswith("gap on untouched data, by the refused model") for line in lines)
+    assert not any("Fc" in line for line in lines)
+
+
+def test_the_page_has_no_numbers_of_what_was_refused(tmp_path: Path) -> None:
+    page(verdict(), 1.0).write(tmp_path / "report.html")
+    text = re.sub(r"data:image[^'\"]*", "", (tmp_path / "report.html").read_text())
+    assert "What was tried and refused" in text
+    assert "These are no findings" in text
+    assert "What was missing" not in text
+    assert "Fc" not in text
+
+
+def test_programs_find_no_effect_and_the_model_has_it_off() -> None:
+    told = json.loads(as_json(verdict(), 1.0))
+    assert told["effects"] == []
+    assert told["parameters"] == {}
+    assert [c["name"] for c in told["refused_candidates"]] == ["stribeck"]
+    written = write_model(verdict().model, {c.name for c in verdict().candidates})
+    assert "on = false" in written
+    assert parse_model(written, "model.toml").effects == {}
+    assert parse_model(write_model(verdict().model), "model.toml").effects != {}
