@@ -61,9 +61,9 @@ def summary(v: Verdict, out: str) -> list[str]:
     if v.effects:
         ruled = ", ".join(v.effects[0].ruled_out)
         more.append(f"why: {v.effects[0].evidence[-1]}" + (f"; ruled out: {ruled}" if ruled else ""))
-    more += [f"note: {note}" for note in reversed(v.notes)]
     if v.candidates:
         more.append(f"tried and refused, not found: {', '.join(c.title for c in v.candidates)}")
+    more += [f"note: {note}" for note in reversed(v.notes)]
     of = "gap on untouched data" if not v.candidates or v.effects else "gap on untouched data, by the refused model"
     last = [f"{of}, {shrunk(v.speaking)}", f"report: {out}"]
     return [*lines, *more[: LINES - len(lines) - len(last)], *last]
