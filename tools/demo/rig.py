@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from sioms.children import PATIENCE_S, ends_with_us
 
@@ -20,17 +21,26 @@ def waiting(what: str) -> Iterator[None]:
     """Say what is waited for where that takes long, and where it fails.
 
     Raises:
-        RuntimeError: what is done within fails, or takes too long.
+        OSError: what is done within fails, or takes too long.
+        BrokenPipeError: nobody reads what is printed.
     """
-    told = threading.Timer(SLOW_S, print, (f"  waiting for {what} ...",), {"flush": True})
+    told = threading.Timer(SLOW_S, _tell, (what,))
     told.daemon = True
     told.start()
     try:
         yield
+    except BrokenPipeError:
+        raise
     except (OSError, RuntimeError) as error:
-        raise RuntimeError(f"wait for {what}: {error}") from error
+        number, text = getattr(error, "errno", None) or errno.EIO, getattr(error, "strerror", None) or str(error)
+        raise OSError(number, f"wait for {what}: {text}") from error
     finally:
         told.cancel()
+
+
+def _tell(what: str) -> None:
+    with suppress(OSError, ValueError):  # nobody reads it: the next step sees that
+        print(f"  waiting for {what} ...", flush=True)
 
 
 def bold(text: str) -> str:
