@@ -300,6 +300,8 @@ class SimAxes(TickDriver):
         reading = self.kit.inputs[node].read(now_ns)
         if reading is None:
             self._command = None  # no motion is made up for
+            if self._servos is not None:
+                self._servos.velocity[:] = 0.0  # a drive that is lost brakes; it does not go on when it comes back
             raise LinkError(f"{node}: no load is known; want the simulated world there")
         return reading
 

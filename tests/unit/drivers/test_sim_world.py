@@ -158,3 +158,16 @@ def test_names_of_fingers_are_one_each_and_steppers_bear_no_loads():
     stepper["stepper"] = {"mass": 0.4, "step": 2e-4, "hold_force": 60.0}
     with pytest.raises(ValueError, match="steppers bear no load"):
         SimAxes.describe("mod0", msgspec.convert({"axis": [stepper]}, SimAxes.Settings))
+
+
+def test_axes_that_lose_their_world_do_not_go_on_when_it_comes_back(bench, cell):
+    _, arm, *_ = cell
+    bench.write(arm, axis=1, control_mode=ControlMode.VELOCITY, velocity=0.1)
+    bench.run(0.3)
+    assert arm._servos.velocity[1] == pytest.approx(0.1, abs=0.01)
+    for node in bench.inputs.values():
+        if node.name.startswith("world."):
+            node.detach()
+    with pytest.raises(LinkError):
+        arm.tick(bench.clock_ns + 1_000_000)
+    assert not np.any(arm._servos.velocity)
