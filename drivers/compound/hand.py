@@ -89,7 +89,7 @@ from sioms.hand.statics import damped_limit, filtered_limit
 from sioms.motion.axis_step import FORCE
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description, unfit
 from sioms.sdk.driver import Kit
 from sioms.sdk.inputs import NotMeasuredError
 
@@ -274,6 +274,11 @@ class HandDriver(Compound):
             oldest_ns, newest_ns = min(oldest_ns, stamp_ns), max(newest_ns, stamp_ns)
             if now_ns - stamp_ns > squeeze.age_max_s * 1e9:
                 self._why = f"{node}: its reading is {(now_ns - stamp_ns) * 1e-9:.3f} s old; want {squeeze.age_max_s} s"
+                return
+            if (
+                squeeze.wrists and unfit(reading["flags"][:2], reading["value"][:2]).any()
+            ):  # a finger tells it by itself
+                self._why = f"{node}: its force is invalid or saturated; want one that may be relied on"
                 return
             rows.append(reading)
         self._force_age_s, self._newest_ns = (now_ns - oldest_ns) * 1e-9, newest_ns

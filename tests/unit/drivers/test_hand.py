@@ -155,3 +155,19 @@ def test_a_module_that_carries_has_three_motors() -> None:
     settings = msgspec.convert({"axis": [axis], "carries": "world.left_joints"}, SimAxes.Settings)
     with pytest.raises(ValueError, match="fewer than 3 motors"):
         SimAxes.describe("left", settings)
+
+
+def test_a_wrist_whose_force_is_invalid_is_not_taken_for_no_contact() -> None:
+    def by_wrists(tables: dict[str, Any]) -> None:
+        tables["hand"]["squeeze"] = {"wrists": ["wrist1", "wrist2"]}
+        for name in ("touch1", "touch2"):
+            tables[name]["tick_hz"] = 20.0
+
+    held = HandCell(by_wrists, compiled=False)
+    before = held.coordinates[D]
+    held.halted.add("wrist2")
+    held.drivers["wrist2"].blocks[0].flags[:] = int(AnalogStatus.INVALID)
+    write(held.bank, [(D, True, 1.0)], held.now_ns)
+    held.advance(0.02)
+    assert "wrist2: its force is invalid" in held.bank.fault_text(D)
+    assert held.coordinates[D] == pytest.approx(before, abs=1e-4)
