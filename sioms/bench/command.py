@@ -40,6 +40,10 @@ BENCHES: dict[str, tuple[str, str]] = {
         "drivers: cycle against the line's speed, streams without loss, stop on a busy line",
     ),
     "tactile": ("tactile", "shape from strain: time of a frame, errors against theory, convergence"),
+    "watch": (
+        "drifts",
+        "the watch of axes in production: drifts named, false alarms, following errors, processor time",
+    ),
     "attack": ("attack", "floods by one user beside victims of another"),
     "hand": ("hand", "the hand's acceptance in a simulated plane: kinematics, rolls, regrasps, force, friction cone"),
     "deaths": (

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from sioms.arguments import whole
+from sioms.reconcile.command import watch
 from sioms.reconcile.command.subjects import SUBJECTS, Say, Subject
 
 EXIT_BAD_INPUT, EXIT_STOPPED = 2, 1
@@ -67,6 +68,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     test.add_argument(
         "--damaged", action="store_true", help="damage what is generated instead, in a hundred ways: nothing is named"
     )
+    watch.add_parser(kinds)
     effects = kinds.add_parser("effects", help="print the library of effects")
     effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)")
     effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
@@ -87,7 +89,8 @@ def run(args: argparse.Namespace) -> int:
         else:
             library.write(args.out)
         return 0
-    _say_when_plain()
+    if args.subject != "watch":  # it compiles nothing
+        _say_when_plain()
     if args.subject == "selftest" and args.damaged:
         from sioms.reconcile.command.damaged import damaged
 
@@ -108,6 +111,8 @@ def run(args: argparse.Namespace) -> int:
     from sioms.reconcile.errors import BadInputError
 
     try:
+        if args.subject == "watch":
+            return watch.run(args, watch.progress)
         if args.subject == "describe":
             return described(args.data, args.out)
         say = (lambda text: None) if args.quiet else _progress

@@ -1,0 +1,221 @@
+"""The causes that drifts have, which of them separates from all others, and what is said where none does.
+
+A cause is a direction, or a few, in which the numbers of an axis change together. It is named where a change along it
+leaves nothing else to explain, and where every other cause leaves far more. Look-alikes that the records do not
+separate are told together, as an open question, with the variable that orders the change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from .moves import Array
+from .normal import ALL_NAMES, PLACE, PLAY, SCALE, TOTAL, UNKNOWN, Estimate, Normal
+from .rows import CONSTANT, DRY, GAP, GIVE, LAG, MASS, PLAYS, SIZE, VISCOUS
+
+#: Energy of a change in units of its variance above which there is one.
+CLEAR = 30.0
+#: What a named cause may leave, and by how much more every other must leave.
+LEFT, RIVAL = 25.0, 16.0
+#: A second direction is needed where it explains so much more.
+NEEDED = 20.0
+#: A change bends the other numbers, too: by this share of its force.
+BENT = 0.05
+#: Causes that a reference tells; a play of at least this share of the smallest that has a column is seen, if at least
+#: this share of the mass is behind it.
+BY_REFERENCE, SMALLEST, BEHIND = ("place", "scale"), 0.5, 0.15
+#: What orders an unexplained change.
+ORDERED = {
+    "mass": "acceleration", "viscous": "speed", "dry": "direction of motion", "constant": "nothing: it is constant",
+    "lag": "change of the acceleration", "give": "second change of the acceleration", "gap0": "reversal of force",
+    "gap1": "reversal of force", "gap2": "reversal of force", "place": "place of the reference",
+    "scale": "distance along the axis", "play": "direction of approach",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """One cause.
+
+    Attributes:
+        text: as a technician says it.
+        unit: of its size, with {x} and {F}; "1": a share.
+        ways: (normal numbers) -> directions, shape (TOTAL, k), the first of which carries its size.
+        signs: that the first coefficient may have: 1, -1 or 0 for both.
+        part_of: a richer cause that contains this one.
+    """
+
+    name: str
+    text: str
+    unit: str
+    ways: Callable[[Array], Array]
+    signs: int = 0
+    part_of: str = ""
+
+
+def _axis(*numbers: int) -> Callable[[Array], Array]:
+    def ways(theta: Array) -> Array:
+        return np.eye(TOTAL)[:, list(numbers)]
+
+    return ways
+
+
+def _weaker(theta: Array) -> Array:
+    way = np.zeros((TOTAL, 1))
+    way[:SIZE, 0] = theta[:SIZE]
+    return way
+
+
+def _stretched(theta: Array) -> Array:
+    way = np.zeros((TOTAL, 1))
+    way[[MASS, VISCOUS, LAG, GIVE], 0] = -theta[[MASS, VISCOUS, LAG, GIVE]]
+    way[SCALE, 0] = 1.0
+    return way
+
+
+CAUSES = (
+    Cause("dry friction", "dry friction has grown: wear, or no lubricant", "{F}", _axis(DRY), 1, "friction"),
+    Cause("less dry friction", "dry friction has fallen: preload is lost", "{F}", _axis(DRY), -1),
+    Cause("viscous friction", "viscous friction has changed: the lubricant ages", "{F} s/{x}",
+          _axis(VISCOUS), 0, "friction"),
+    Cause("friction", "dry and viscous friction have changed", "{F}", _axis(DRY, VISCOUS)),
+    Cause("mass", "the moved mass has changed", "{m}", _axis(MASS)),
+    Cause("lower force", "the drive gives less force than commanded", "1", _weaker, 1),
+    Cause("more force", "the drive gives more force than commanded", "1", _weaker, -1),
+    Cause("backlash", "there is more play", "{x}", _axis(GAP, GAP + 1, GAP + 2, PLAY, LAG, GIVE), 0),
+    Cause("scale", "the position is scaled: pulley, coupling or encoder", "1", _stretched),
+    Cause("place", "the place is shifted: a belt has slipped, or a screw is loose", "{x}", _axis(PLACE)),
+    Cause("constant force", "a constant force has changed, or friction differs by direction", "{F}", _axis(CONSTANT)),
+    Cause("elasticity", "the transmission yields more", "{m} s^2", _axis(GIVE), 0, "backlash"),
+    Cause("drive lag", "the drive is later", "{m} s", _axis(LAG), 0, "backlash"),
+)  # fmt: skip
+BY_NAME = {cause.name: cause for cause in CAUSES}
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """What some blocks say against what is normal.
+
+    Attributes:
+        gain: energy of the change along the best cause, in units of its variance; above CLEAR there is one.
+        names: of causes that explain it: one is a name, several are an open question, none: no known cause.
+        size, low, high: of the first one.
+        change: of all numbers, shape (TOTAL,).
+        ordered: the variable that orders it.
+        share: of the usual force that the change makes.
+    """
+
+    gain: float
+    names: tuple[str, ...]
+    size: float
+    low: float
+    high: float
+    change: Array
+    ordered: str
+    share: float
+
+    @property
+    def is_drift(self) -> bool:
+        """Whether something has changed."""
+        return self.gain > CLEAR
+
+
+def judge(normal: Normal, now: Estimate, travel: float) -> Finding:
+    """Say what some blocks say against what is normal."""
+    change = now.theta - normal.theta
+    cover = now.noise + normal.own
+    change, cover = _without_loads(normal, change, cover)
+    energy = float(change[:SIZE] @ now.gram[:SIZE, :SIZE] @ change[:SIZE])
+    bent = float(np.sqrt(max(energy, 0.0) / now.rows))
+    fits = {cause.name: _fit(cause, normal.theta, change, cover) for cause in CAUSES}
+    nothing = float(change @ np.linalg.solve(cover, change))
+    best = max((nothing - left for left, *_ in fits.values()), default=0.0)
+    slack = cover.copy()
+    at = np.arange(SIZE)
+    slack[at, at] += (BENT * bent / np.maximum(normal.per, 1e-300)) ** 2
+    places = np.abs(change[[PLACE, PLAY]]).max() if cover[PLACE, PLACE] < UNKNOWN / 2 else 0.0
+    slack[[PLACE, PLAY], [PLACE, PLAY]] += (BENT * places) ** 2
+    loose = {cause.name: _fit(cause, normal.theta, change, slack) for cause in CAUSES}
+    names = _names({name: left for name, (left, *_) in loose.items()})
+    if len(names) == 1 and names[0] in BY_REFERENCE and not _without_play(normal, now, change, travel):
+        names = (*names, "backlash")
+    scores = change**2 / np.diag(cover)
+    ordered = ORDERED[ALL_NAMES[int(np.argmax(scores))]]
+    size, wide = _size(BY_NAME[names[0]], normal, now, loose[names[0]], travel) if names else (np.nan, np.nan)
+    return Finding(best, names, size, size - wide, size + wide, change, ordered, bent / normal.force)
+
+
+def _without_loads(normal: Normal, change: Array, cover: Array) -> tuple[Array, Array]:
+    """Forget the mass where it is within those of the loads that are carried."""
+    lightest = normal.theta[MASS] + change[MASS]
+    if not normal.loads or not 0.97 * normal.least < lightest < 1.03 * normal.most:
+        return change, cover
+    cover = cover.copy()
+    cover[MASS, :] = cover[:, MASS] = 0.0
+    cover[MASS, MASS] = UNKNOWN
+    return change, cover
+
+
+def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -> bool:
+    """Say whether a shift of the reference's edges cannot be play: by which flank bears at each, play shifts them, too.
+
+    The mass behind so large a play would show at reversals of force; what is too small for that is not told apart.
+    """
+    spread = max(normal.edges, default=0.0) - min(normal.edges, default=0.0)
+    gap = 2.0 * max(abs(float(change[PLACE])), abs(float(change[SCALE])) * spread)
+    plays = slice(GAP, GAP + len(PLAYS))
+    behind = float(np.sum(change[plays]))
+    sure = float(np.sqrt(np.sum((now.noise + normal.own)[plays, plays])))
+    return gap > SMALLEST * PLAYS[0] * travel and behind + 2.0 * sure < BEHIND * abs(float(normal.theta[MASS]))
+
+
+def _fit(cause: Cause, theta: Array, change: Array, cover: Array) -> tuple[float, Array, Array]:
+    """Return what a cause leaves of a change, its coefficients and their covariance."""
+    ways = cause.ways(theta)
+    weighed = np.linalg.solve(cover, ways)
+    information = ways.T @ weighed
+    inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+    along = inverse @ (weighed.T @ change)
+    if cause.signs and along[0] * cause.signs < 0.0:
+        along = np.zeros_like(along)
+    rest = change - ways @ along
+    return float(rest @ np.linalg.solve(cover, rest)), along, inverse
+
+
+def _names(left: dict[str, float]) -> tuple[str, ...]:
+    """Return the causes that explain a change, the best first; a richer one only where it is needed."""
+    kept = dict(left)
+    for cause in CAUSES:
+        richer = cause.part_of
+        if (
+            richer
+            and richer in kept
+            and kept.get(cause.name, np.inf) - kept[richer] < NEEDED
+            and kept[cause.name] < LEFT
+        ):
+            del kept[richer]
+    order = sorted(kept, key=lambda name: kept[name])
+    if not order or kept[order[0]] > LEFT:
+        return ()
+    return tuple(name for name in order if kept[name] < kept[order[0]] + RIVAL)
+
+
+def _size(
+    cause: Cause, normal: Normal, now: Estimate, fit: tuple[float, Array, Array], travel: float
+) -> tuple[float, float]:
+    """Return the size of a cause and half the width of its interval of 95 %."""
+    _, along, inverse = fit
+    half = 1.96 * float(np.sqrt(max(inverse[0, 0], 0.0)))
+    if cause.name in ("lower force", "more force"):
+        return 1.0 / (1.0 + float(along[0])), half / (1.0 + float(along[0])) ** 2
+    if cause.name != "backlash":
+        return float(along[0]), half
+    play, known = now.theta[PLAY] - normal.theta[PLAY], now.noise[PLAY, PLAY]
+    if known < UNKNOWN / 2:
+        return float(play), 1.96 * float(np.sqrt(known + normal.own[PLAY, PLAY]))
+    weight = np.maximum(along[:3], 0.0) * PLAYS
+    gap = travel * float(weight @ PLAYS / max(weight.sum(), 1e-300))
+    return gap, 0.7 * gap

@@ -1,0 +1,223 @@
+"""What is normal of an axis: its numbers in the commissioning phase, and how they vary there by themselves.
+
+All vectors have the numbers of ``rows`` and then those of the reference: its place, its scale and the play there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from .blocks import Block, solved
+from .moves import Array
+from .rows import GAP, MASS, NAMES, SIZE
+
+ALL_NAMES = (*NAMES, "place", "scale", "play")
+TOTAL = len(ALL_NAMES)
+PLACE, SCALE, PLAY = SIZE, SIZE + 1, SIZE + 2
+#: Blocks whose numbers together are compared, and the least number of such groups.
+GROUP, LEAST_GROUPS = 6, 10
+#: What is learnt from less than so many blocks is not believed.
+FEWEST = 20
+#: Changes below this share of the usual force are of no interest, whatever the number.
+IDLE_SHARE = 0.006
+#: The same for the place of a reference, of the travel and in steps of the encoder, and for its scale.
+IDLE_PLACE, IDLE_STEPS, IDLE_SCALE = 1e-5, 2.0, 2e-4
+#: Masses of moves that differ by this share of the least are of loads that change.
+LOADS = 0.03
+#: What varies in commissioning may vary by so many times as much (in variance): it has not seen everything.
+UNSEEN = 1.5
+#: Neighbouring rows and the model's own errors leave fewer independent rows than there are: at least so many times.
+ALIKE = 2.0
+#: A variance beyond all: the number is not known.
+UNKNOWN = 1e12
+#: Crossings within this share of the travel are of one edge.
+ONE_EDGE = 0.01
+
+
+@dataclass(frozen=True, slots=True)
+class Normal:
+    """What is normal.
+
+    Attributes:
+        theta: numbers, shape (TOTAL,), those of the reference zero.
+        own: covariance of their own variation, shape (TOTAL, TOTAL).
+        noise: variance of a force that the model leaves, with its correlation, [N^2].
+        force: root mean square of the force that moves the axis [N].
+        per: force of each number's unit: root mean squares of the columns, shape (SIZE,).
+        loads: whether moves carry different masses; least, most: of the masses.
+        edges: places of the reference's edges; scatter: of a crossing.
+        error: mean square following error.
+        blocks: learnt from; until_s: of the axis's clock.
+    """
+
+    theta: Array
+    own: Array
+    noise: float
+    force: float
+    per: Array
+    loads: bool
+    least: float
+    most: float
+    edges: tuple[float, ...]
+    scatter: float
+    error: float
+    blocks: int
+    until_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Numbers of some blocks and their covariance, without the axis's own variation; what is not known has UNKNOWN.
+
+    ``left`` is the mean square of force that the model leaves; ``gram`` and ``rows`` are of the blocks.
+    """
+
+    theta: Array
+    noise: Array
+    left: float
+    gram: Array
+    rows: int
+
+
+def estimate(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, noise: float) -> Estimate:
+    """Return the numbers of some blocks.
+
+    Args:
+        loads: each move has a mass of its own; that of the lightest is told.
+        edges, scatter: of the reference.
+        noise: variance of a row; what these blocks leave counts if it is more.
+    """
+    gram, rows = np.sum([b.gram for b in blocks], axis=0), sum(b.rows for b in blocks)
+    theta, cover = np.zeros(TOTAL), np.zeros((TOTAL, TOTAL))
+    if loads:
+        kept = np.arange(SIZE) != MASS
+        found, inverse, left = solved(np.sum([b.freed for b in blocks], axis=0))
+        at = np.flatnonzero(kept)
+        theta[at] = found
+        masses = np.array([b.least for b in blocks if np.isfinite(b.least)])
+        theta[MASS] = float(np.mean(masses)) if len(masses) else 0.0
+        cover[MASS, MASS] = float(np.var(masses)) / len(masses) if len(masses) > 2 else UNKNOWN
+    else:
+        found, inverse, left = solved(gram)
+        at = np.arange(SIZE)
+        theta[:SIZE] = found
+    left = left / max(rows - SIZE, 1)
+    cover[np.ix_(at, at)] = max(noise, ALIKE * left) * inverse
+    _refer(blocks, edges, scatter, theta, cover)
+    return Estimate(theta, cover, left, gram, rows)
+
+
+def _refer(blocks: Sequence[Block], edges: Sequence[float], scatter: float, theta: Array, cover: Array) -> None:
+    """Fill in place, scale and play of the reference."""
+    unknown = np.diag([UNKNOWN] * 3)
+    places = np.array([(c.place, c.way) for b in blocks for c in b.crossings], dtype=np.float64).reshape(-1, 2)
+    cover[SIZE:, SIZE:] = unknown
+    if not edges or len(places) < 4:
+        return
+    nearest = np.abs(places[:, :1] - np.array(edges)).argmin(axis=1)
+    marks, way = np.array(edges)[nearest], places[:, 1]
+    off = places[:, 0] - marks
+    columns = [np.ones(len(off))]
+    known = [PLACE]
+    if len(set(nearest.tolist())) > 1:
+        columns.append(marks)
+        known.append(SCALE)
+    if abs(float(np.mean(way))) < 0.9:
+        columns.append(0.5 * way)
+        known.append(PLAY)
+    x = np.column_stack(columns)
+    inverse = np.linalg.pinv(x.T @ x)
+    theta[known] = inverse @ x.T @ off
+    cover[np.ix_(known, known)] = max(scatter, 1e-12) ** 2 * inverse
+
+
+def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
+    """Learn what is normal from the blocks of the commissioning phase.
+
+    Args:
+        travel: of the axis [m or rad]; step: of its encoder.
+
+    Raises:
+        ValueError: there are too few.
+    """
+    if len(blocks) < FEWEST:
+        raise ValueError(f"learn what is normal: {len(blocks)} blocks of motion; needs {FEWEST} or more")
+    least = np.array([b.least for b in blocks if np.isfinite(b.least)])
+    most = np.array([b.most for b in blocks if np.isfinite(b.most)])
+    low, high = (float(np.min(least)), float(np.max(most))) if len(least) else (0.0, 0.0)
+    spread = float(np.median(most - least)) if len(least) else 0.0
+    loads = len(least) > 0 and spread > LOADS * abs(float(np.median(least)))
+    edges, scatter = _edges(blocks, travel, step)
+    whole = estimate(blocks, loads, edges, scatter, 0.0)
+    noise = _noise(blocks, loads, edges, scatter, whole.left)
+    theta = whole.theta.copy()
+    per = np.sqrt(np.diag(whole.gram)[:SIZE] / whole.rows)
+    force = float(np.sqrt(whole.gram[-1, -1] / whole.rows))
+    own = _own(blocks, loads, edges, scatter, noise, theta)
+    floor = np.zeros(TOTAL)
+    floor[:SIZE] = IDLE_SHARE * force / np.maximum(per, 1e-300)
+    floor[[PLACE, PLAY]] = IDLE_PLACE * travel + IDLE_STEPS * step + scatter
+    floor[SCALE] = IDLE_SCALE
+    return Normal(
+        theta, UNSEEN * own + np.diag(floor**2), noise, force, per, loads, low, high, edges, scatter,
+        float(np.mean([b.error for b in blocks])), len(blocks), blocks[-1].end_s,
+    )  # fmt: skip
+
+
+def _edges(blocks: Sequence[Block], travel: float, step: float) -> tuple[tuple[float, ...], float]:
+    """Return the places of the reference's edges and the scatter of a crossing about its side of an edge."""
+    all_ = sorted((c.place, c.way) for b in blocks for c in b.crossings)
+    if len(all_) < 8:
+        return (), 0.0
+    places, ways = np.array([p for p, _ in all_]), np.array([w for _, w in all_])
+    groups = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) > ONE_EDGE * travel) + 1)
+    edges, left = [], []
+    for group in groups:
+        if len(group) < 4:
+            continue
+        sides = [places[group][ways[group] == way] for way in (-1, 1)]
+        means = [float(np.median(side)) for side in sides if len(side)]
+        edges.append(float(np.mean(means)))
+        left += [side - np.median(side) for side in sides if len(side)]
+    scatter = float(np.std(np.concatenate(left))) if left else 0.0
+    return tuple(edges), max(scatter, 0.3 * step)
+
+
+def _noise(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, left: float) -> float:
+    """Return the variance of a row that makes neighbouring blocks as different as they are."""
+    each = [estimate([b], loads, edges, scatter, 0.0) for b in blocks]
+    ratios = []
+    for one, two in pairwise(each):
+        change = (two.theta - one.theta)[:GAP]
+        expected = (np.diag(one.noise) + np.diag(two.noise))[:GAP]
+        ratios.append(change[1:4] ** 2 / np.maximum(expected[1:4], 1e-300))
+    return ALIKE * left * max(1.0, float(np.median(ratios)) / 0.45)  # the median of a squared normal deviate
+
+
+def _own(
+    blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, noise: float, theta: Array
+) -> Array:
+    """Return the covariance of how the numbers vary by themselves, over minutes, beyond what noise explains."""
+    few = GROUP if len(blocks) >= LEAST_GROUPS * GROUP else max(len(blocks) // LEAST_GROUPS, 1)
+    groups = [blocks[i : i + few] for i in range(0, len(blocks) - few + 1, few)]
+    each = [estimate(g, loads, edges, scatter, noise) for g in groups]
+    covers = np.stack([e.noise for e in each])
+    told = np.stack([np.diag(c) < UNKNOWN / 2 for c in covers])
+    off = np.where(told, np.stack([e.theta for e in each]) - theta, 0.0)
+    spread = np.where(told, np.stack([np.diag(c) for c in covers]), np.nan)
+    with np.errstate(invalid="ignore"):
+        usual = np.array([np.median(c[np.isfinite(c)]) if np.isfinite(c).any() else np.inf for c in spread.T])
+        poor = np.nanmax(np.where(told, spread / usual, 1.0), axis=1)
+    # groups that hardly tell a number do not tell how it varies
+    weight = 1.0 / np.maximum(poor, 1.0) ** 2
+    both = told[:, :, None] & told[:, None, :]
+    share = np.where(both, weight[:, None, None], 0.0)
+    total = np.maximum(share.sum(axis=0), 1e-300)
+    excess = np.sum(share * (off[:, :, None] * off[:, None, :] - np.where(both, covers, 0.0)), axis=0) / total
+    size = np.sqrt(np.maximum(np.diag(np.sum(share * off[:, :, None] * off[:, None, :], axis=0) / total), 1e-300))
+    values, vectors = np.linalg.eigh(excess / np.outer(size, size))
+    return np.asarray((vectors * np.maximum(values, 0.0)) @ vectors.T * np.outer(size, size))

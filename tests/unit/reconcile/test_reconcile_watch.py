@@ -1,0 +1,198 @@
+"""The watch of axes in production: moves, numbers of an axis, what is normal, causes, state, proposals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from sioms.documents import json_of, json_text
+from sioms.reconcile.watch.axis import About, AxisWatch, Settings
+from sioms.reconcile.watch.blocks import solved
+from sioms.reconcile.watch.causes import judge
+from sioms.reconcile.watch.keep import packed, restore
+from sioms.reconcile.watch.moves import Cutter, Samples
+from sioms.reconcile.watch.normal import ALL_NAMES, TOTAL, Estimate, Normal
+from sioms.reconcile.watch.propose import Gains, margin
+from sioms.reconcile.watch.rows import CONSTANT, DRY, MASS, PLAYS, SIZE, VISCOUS, kernels, rows_of, wind_up
+
+TICK_S = 0.001
+ABOUT = About("mod0.xaxis", False, TICK_S, 100.0, 0.4, 1e-6, 0.5)
+
+
+def samples(position: np.ndarray, force: np.ndarray, start_s: float = 0.0, moving: slice = slice(60, -60)) -> Samples:
+    n = len(position)
+    moves = np.zeros(n, dtype=np.bool_)
+    moves[moving] = True
+    time_s = start_s + TICK_S * np.arange(n)
+    return Samples(time_s, position, force, position, np.gradient(position, TICK_S), moves, np.ones(n, dtype=np.bool_))
+
+
+def swing(n: int = 1500, size: float = 0.1) -> np.ndarray:
+    t = TICK_S * np.arange(n)
+    return np.asarray(size * np.sin(2 * np.pi * 1.3 * t) * np.sin(2 * np.pi * 0.4 * t))
+
+
+def test_kernels_give_the_derivatives_of_polynomials() -> None:
+    k = kernels(8.0)
+    t = np.arange(len(k)) - len(k) // 2
+    for power in range(5):
+        for order in range(5):
+            falling = np.prod(np.arange(power - order + 1, power + 1)) if order <= power else 0.0
+            even = {0: 1.0, 2: 1.0, 4: 3.0}.get(power - order, 0.0)
+            assert k[:, order] @ (t / 8.0) ** power == pytest.approx(falling * even / 8.0**order, abs=1e-9)
+
+
+def test_the_numbers_of_an_exact_motion_come_out() -> None:
+    x = swing()
+    v = np.gradient(x, TICK_S)
+    a = np.gradient(v, TICK_S)
+    u = 2.0 * a + 8.0 * v + 3.0 * np.sign(v) + 0.5
+    held = np.append(u[1:] + u[:-1], 2 * u[-1]) / 2  # what is commanded at a tick acts until the next one
+    rows = rows_of(samples(x, held), TICK_S, 0.5, PLAYS * 0.4, None)
+    assert rows is not None
+    table = np.column_stack([rows.x, rows.y])
+    theta, _, left = solved(table.T @ table)
+    assert theta[[MASS, VISCOUS, DRY, CONSTANT]] == pytest.approx([2.0, 8.0, 3.0, 0.5], rel=0.03)
+    assert left / len(rows.y) < 0.05**2
+
+
+def test_a_play_is_passed_between_one_push_and_the_other() -> None:
+    t = TICK_S * np.arange(400)
+    a = np.where(t < 0.2, 5.0, -5.0)
+    v = np.cumsum(a) * TICK_S
+    x = np.cumsum(v) * TICK_S
+    wind = wind_up(x, v, a, np.array([1e-4, 4e-4]), TICK_S)
+    assert wind[100] == pytest.approx([0.5e-4, 2e-4]) and wind[-1] == pytest.approx([-0.5e-4, -2e-4])
+    taken = np.sum(np.abs(wind) < 0.499 * np.array([1e-4, 4e-4]), axis=0) * TICK_S
+    assert taken == pytest.approx(np.sqrt(2 * np.array([1e-4, 4e-4]) / 5.0), abs=2.1e-3)  # free way under its brake
+
+
+def test_moves_are_the_same_however_the_samples_come_in_pieces() -> None:
+    one = samples(swing(), swing())
+    both = one.and_then(samples(swing(900), swing(900), 1.5))
+    whole = list(Cutter(TICK_S, 100.0).feed(both.and_then(samples(np.zeros(100), np.zeros(100), 2.4, slice(0, 0)))))
+    rng = np.random.default_rng(3)
+    for _ in range(20):
+        cutter, found, at = Cutter(TICK_S, 100.0), [], 0
+        padded = both.and_then(samples(np.zeros(100), np.zeros(100), 2.4, slice(0, 0)))
+        while at < len(padded):
+            to = min(at + int(rng.integers(1, 400)), len(padded))
+            found += cutter.feed(padded.part(at, to))
+            at = to
+        assert [(len(m), m.time_s[0]) for m in found] == [(len(m), m.time_s[0]) for m in whole]
+    assert len(whole) == 2
+
+
+def test_what_is_pressed_stopped_or_torn_is_no_move() -> None:
+    good = samples(swing(), swing())
+    usable = good.usable.copy()
+    usable[700] = False
+    assert all(len(m) < 1000 for m in Cutter(TICK_S, 100.0).feed(replace(good, usable=usable)))
+    assert not list(Cutter(TICK_S, 100.0).feed(replace(good, force=np.full(len(good), 99.0))))
+    torn = good.time_s.copy()
+    torn[700:] += 0.05
+    moves = list(Cutter(TICK_S, 100.0).feed(replace(good, time_s=torn)))
+    assert all(np.ptp(np.diff(m.time_s)) < 1e-6 for m in moves)
+
+
+def normal(**changes: float) -> Normal:
+    """An axis of 2 kg, 8 N s/m and 4 N, whose numbers vary by a percent or two of its force."""
+    theta, own = np.zeros(TOTAL), np.full(TOTAL, 1e-3)
+    theta[[MASS, VISCOUS, DRY]] = 2.0, 8.0, 4.0
+    own[[MASS, VISCOUS, DRY, CONSTANT]] = 0.02, 0.3, 0.08, 0.05
+    own[SIZE:] = 1e-5, 1e-4, 1e-5
+    per = np.array([2.5, 0.3, 1.0, 1.0, 50.0, 1e4, 5.0, 5.0, 5.0])
+    return Normal(theta, np.diag(own**2), 0.01, 7.0, per, False, 2.0, 2.0, (0.03, 0.08), 1e-6, 1e-10, 100, 0.0)
+
+
+def now(reference: bool = True, **changes: float) -> Estimate:
+    was = normal()
+    theta = was.theta.copy()
+    for name, change in changes.items():
+        theta[ALL_NAMES.index(name)] += change
+    noise = np.diag((0.1 * np.sqrt(np.diag(was.own))) ** 2)
+    if not reference:
+        noise[SIZE:, SIZE:] = np.eye(3) * 1e12
+    gram = np.zeros((SIZE + 1, SIZE + 1))
+    gram[np.arange(SIZE), np.arange(SIZE)] = 1000 * was.per**2
+    return Estimate(theta, noise, 0.01, gram, 1000)
+
+
+def test_each_cause_is_told_by_its_pattern() -> None:
+    cases = {
+        "dry friction": {"dry": 2.0},
+        "viscous friction": {"viscous": 6.0},
+        "mass": {"mass": 0.4},
+        "lower force": {"mass": 0.5, "viscous": 2.0, "dry": 1.0},
+        "place": {"place": 5e-4},
+        "scale": {"mass": -0.1, "viscous": -0.4, "scale": 0.05},
+        "friction": {"dry": 2.0, "viscous": -6.0},
+    }
+    for name, change in cases.items():
+        found = judge(normal(), now(**change), 0.4)
+        assert found.is_drift and found.names == (name,), (name, found.names)
+        assert found.low <= found.size <= found.high
+
+
+def test_what_does_not_separate_is_left_open_and_what_is_unknown_unnamed() -> None:
+    assert not judge(normal(), now(dry=0.1, viscous=0.3), 0.4).is_drift
+    alike = judge(normal(), now(False, mass=-0.12), 0.4)  # without a reference a scale looks like a mass
+    assert alike.is_drift and set(alike.names) >= {"mass", "scale"}
+    odd = judge(normal(), now(mass=0.8, dry=-3.0, constant=2.0), 0.4)
+    assert odd.is_drift and odd.names == ()
+    carried = replace(normal(), loads=True, least=2.0, most=2.6)
+    assert not judge(carried, now(mass=0.5), 0.4).is_drift, "loads of that mass are usual there"
+
+
+def test_the_state_comes_back_and_damaged_state_is_left_out() -> None:
+    watch = AxisWatch(ABOUT, Settings())
+    watch.normal, watch.motion_s = normal(), 1234.5
+    text = json_text(packed(watch, 1000.0))
+    again = AxisWatch(ABOUT, Settings())
+    assert restore(again, json_of(text), 900.0) == ""
+    assert again.normal is not None and again.normal.theta == pytest.approx(watch.normal.theta)
+    assert again.normal.until_s == pytest.approx(100.0), "the axis's clock began anew 100 s later"
+    assert json_of(json_text(packed(again, 900.0))) == json_of(text)
+    kept = json_of(text)
+    for key in kept:
+        for wrong in (None if key not in ("normal", "drift") else 7, "x", [1], {"theta": []}, float("inf")):
+            fresh = AxisWatch(ABOUT, Settings())
+            assert restore(fresh, {**kept, key: wrong}, 0.0) and fresh.normal is None
+    other = AxisWatch(replace(ABOUT, travel=0.5), Settings())
+    assert "another travel" in restore(other, kept, 0.0)
+
+
+def test_a_margin_is_that_of_the_loop() -> None:
+    rate = 2 * np.pi * 20.0
+    lead = 2 * 2.0 * rate / TICK_S
+    k = 2.0 * rate**2 + lead
+    gains = Gains(k, -lead / k, 0.0, 0.0)
+    assert 0.6 < margin(gains, 2.0, 0.0, TICK_S) < 1.0
+    assert margin(gains.scaled(400.0, 20.0), 2.0, 0.0, TICK_S) == 0.0, "so stiff it is unstable"
+    same = gains.scaled(2.0, 2.0)
+    assert margin(same, 4.0, 0.0, TICK_S) == pytest.approx(margin(gains, 2.0, 0.0, TICK_S), rel=1e-6)
+
+
+def test_the_numbers_of_a_simulated_production_come_out_and_a_weaker_drive_scales_them() -> None:
+    """The generator has a plant of its own: what is drawn there is what the regression finds."""
+    production = pytest.importorskip("sioms.reconcile_selftest.production", exc_type=ImportError)
+    found = {}
+    machine = production.draw_machine(1, 0)
+    for name, each in (("new", machine), ("weak", machine.drifted("force", 0.2))):
+        sums = np.zeros((SIZE + 1, SIZE + 1))
+        for move in production.Day(each, 5).moves(120.0):
+            n = len(move.position)
+            start = move.start_s + TICK_S * np.arange(n)
+            seen = Samples(
+                start, move.position, move.force, move.command, move.speed, move.moving, np.ones(n, dtype=np.bool_)
+            )
+            rows = rows_of(seen, TICK_S, machine.speed, PLAYS * 2 * machine.travel, None)
+            if rows is not None:
+                table = np.column_stack([rows.x, rows.y])
+                sums += table.T @ table
+        found[name] = solved(sums)[0][[MASS, DRY, CONSTANT]]
+    body = machine.body
+    assert found["new"] == pytest.approx([body.mass, body.dry, -body.constant], rel=0.15)
+    assert found["weak"] == pytest.approx(found["new"] / 0.8, rel=0.03)
