@@ -35,15 +35,17 @@ import numpy as np
 
 from sioms.kinematics import Joint, Reach, Transform, forces
 from sioms.motion import AxisBank, AxisKind, AxisSettings, CommandError
-from sioms.motion.axis_step import FORCE, HOLD, STOP
+from sioms.motion.axis_step import FORCE, HOLD, SETTLING, STOP
 from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import WRITE
 from sioms.sdk.blocks import AnyBlock, AxisBlock, BlockSpec, Description
-from sioms.sdk.driver import HeldNode, Kit, TickDriver
+from sioms.sdk.driver import AtLimitError, HeldNode, Kit, TickDriver
 from sioms.sdk.exchange import LinkError
 from sioms.sdk.inputs import NotMeasuredError
 from sioms.sdk.tables import from_table, table_type
+
+from .readings import LATCHED, Past, Reading, Readings
 
 MODES = ControlMode(0x7FFF) & ~(
     ControlMode.FORCE
@@ -54,7 +56,6 @@ MODES = ControlMode(0x7FFF) & ~(
 )
 _POSITION, _RELATIVE = int(ControlMode.POSITION), int(ControlMode.RELATIVE)
 _TARGET = list(WRITE[NodeClass.AXIS]).index("position")
-_LATCHED = int(AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT)
 _LOST = int(AxisStatus.POSITION_LOST)
 _SATURATED = int(AxisStatus.SATURATED)
 
@@ -62,6 +63,10 @@ _SETTLE_NS = 250_000_000
 """How long the error of coordinates at rest is brought back before the held axes hold by themselves."""
 _LATE = 4
 """Ticks by which held axes may follow late."""
+_SPARE = 0.5
+"""Part of the margin of its speed that a coordinate may use to catch up."""
+_JUMP = 2.0
+"""Speeds, in velocity limits, at which a set-point has not moved but begun anew elsewhere."""
 
 CoordinateTable: Any = table_type(
     AxisSettings,
@@ -167,12 +172,16 @@ class Compound(TickDriver):
             markers=kit.markers,
             capacity=settings.capacity,
             late_max_s=settings.late_max_s,
+            derived=True,
         )
         self._block = AxisBlock(spec, self.bank, admits=self.admit)
         self._map = self.transform(settings)
         self._reach = Reach(self._map, ())
+        self._readings = Readings((), {}, {})
         self._angles = [i for i, unit in enumerate(self.COORDINATES.values()) if unit == "rad"]
         self._all = np.arange(self.bank.n)
+        self._set_points = Past()
+        self._errors: list[float] = []
         self._joints: list[float] = []
         self._at: list[float] = []
         self._moved_ns = 0
@@ -240,68 +249,52 @@ class Compound(TickDriver):
         if len(joints) != self.bank.n:
             raise LinkError(f"axes: {len(joints)} axes are held; want {self.bank.n}")
         self._reach = Reach(self._map, joints)
+        self._readings = Readings(self.settings.axes, self.kit.inputs, self.kit.held)
+        self.bank.believe()  # their own devices say whether they have lost their places
         for held in self._held:
             held.trouble()
         self._read(self.kit.now_ns())
 
     def tick(self, now_ns: int) -> None:
         """Read the held axes, move the coordinates, drive the held axes."""
-        status, load = self._read(now_ns)
+        taken = self._read(now_ns)
         trouble = [error for held in self._held if (error := held.trouble()) is not None]
         if any(not held.is_there for held in self._held):
             self._lose(str(trouble[0]) if trouble else "an axis is not held any more")
-        self.bank.tick(now_ns, np.array(self._at))
-        if status & _LOST:
+        self.bank.tick(now_ns, np.array(self._at), seen_ns=self._block.stamp_ns)
+        if taken.status & _LOST:
             self.bank.lose_place(self._all, "a held axis has lost its place", now_ns)
+        self._follow(now_ns)
         loop = self.bank.arrays
-        if trouble or (status & _LATCHED and not self._halted):
-            text = str(trouble[0].strerror) if trouble else "a held axis is stopped or in fault"
+        wrong = [error for error in trouble if not isinstance(error, AtLimitError)]
+        if wrong or (taken.latched and not self._halted):
+            text = str(wrong[0].strerror) if wrong else taken.latched
             self.bank.fault(self._all, text, now_ns)
-        if np.count_nonzero(loop["latched"] & _LATCHED):
+        elif trouble:  # it came there later, or sooner, than could be foreseen
+            self._end_reach(str(trouble[0].strerror), now_ns)
+        if np.count_nonzero(loop["latched"] & LATCHED):
             self._halt(now_ns)
         elif self._halted:
             self._go_on()
         else:
             self._move(now_ns)
-        self.bank.rows["force"][:] = forces(self._map, self._at, load)
+        self.bank.rows["force"][:] = forces(self._map, self._at, taken.load)
 
     def close(self) -> None:
         """Stop the held axes."""
         self._stop()
 
-    def _read(self, now_ns: int) -> tuple[int, list[float]]:
-        """Take the positions of the held axes; return their status together, and their forces.
-
-        A stop or fault from before the end of a reset that has been sent does not count.
+    def _read(self, now_ns: int) -> Reading:
+        """Take what the held axes show.
 
         Raises:
             LinkError: one is lost, or the coordinates mean nothing there.
         """
-        joints: list[float] = []
-        rates: list[float] = []
-        stamps: list[int] = []
-        load: list[float] = []
-        status = 0
-        for name in self.settings.axes:
-            node = self.kit.inputs[name]
-            reading = node.read(now_ns)
-            if reading is None:
-                self._lose(f"{name}: its position is not known; want its device up")
-            if not np.isfinite(reading["value"]).all():
-                self._lose(f"{name}: its position is not a finite number")
-            joints += reading["value"].tolist()
-            rates += reading["commanded_velocity"].tolist()
-            stamps += [node.stamp_ns] * (len(joints) - len(stamps))
-            load += reading["force"].tolist()
-            shown = int(np.bitwise_or.reduce(reading["status"].astype(np.int64)))
-            status |= shown if node.as_of_ns >= self.kit.held[name].shows_reset_ns else shown & ~_LATCHED
-        stamp_ns = min(stamps)
-        # Where they were at one instant: a device that shows its axes later than another would look like a skew.
-        joints = [
-            at - rate * (stamp - stamp_ns) * 1e-9 if math.isfinite(rate) else at
-            for at, rate, stamp in zip(joints, rates, stamps, strict=True)
-        ]
-        joints = self.bent(joints, load)
+        try:
+            taken = self._readings.take(now_ns)
+        except LinkError as error:
+            self._lose(str(error))
+        joints = self.bent(taken)
         try:
             found = list(self._map.forward(joints))
         except ValueError as error:
@@ -309,17 +302,16 @@ class Compound(TickDriver):
         if self._at:
             for i in self._angles:  # no jump where an angle is wrapped
                 found[i] = self._at[i] + math.remainder(found[i] - self._at[i], math.tau)
-        self._joints, self._at, self._block.stamp_ns = joints, found, stamp_ns
-        return status, load
+        self._joints, self._at, self._block.stamp_ns = joints, found, taken.stamp_ns
+        return taken
 
-    def bent(self, joints: list[float], load: Sequence[float]) -> list[float]:
+    def bent(self, taken: Reading) -> list[float]:
         """Return where the joints are behind what gives between their encoders and the mechanics; here nothing does.
 
         Args:
-            joints: as the held axes show them.
-            load: force [N] or torque [N m] with which each drives.
+            taken: what the held axes show.
         """
-        return joints
+        return taken.joints
 
     def _lose(self, why: str) -> NoReturn:
         self._stop()
@@ -337,7 +329,7 @@ class Compound(TickDriver):
         self._halted = True
         for name in self.settings.axes:
             self._seen_ns[name] = self.kit.inputs[name].as_of_ns
-        latched = self.bank.arrays["latched"] & _LATCHED
+        latched = self.bank.arrays["latched"] & LATCHED
         if not latched.all():
             axis = int(latched.argmax())
             why = self.bank.fault_text(axis) or "emergency stop"
@@ -356,26 +348,43 @@ class Compound(TickDriver):
             held.reset(self._seen_ns[held.name])
 
     def _move(self, now_ns: int) -> None:
-        bank, loop = self.bank, self.bank.arrays
-        if not bank.is_idle(self._all):
-            self._moved_ns = now_ns
-        elif now_ns - self._moved_ns > _SETTLE_NS:
+        if self._rests(now_ns):
             if self._drives:
-                self._drive([0.0] * bank.n)
-            self._drives = False
+                self._stop()
             return
         wanted = self._wanted(now_ns)
         try:
             self._reach.check(self._ahead(wanted), self._at, self._joints)
         except ValueError as error:
-            going = np.flatnonzero((loop["kind"] != HOLD) & (loop["kind"] != STOP))
-            if going.size:
-                bank.abandon(going, now_ns, errno.ERANGE, f"the end of reach: {error}")
+            self._end_reach(str(error), now_ns)
         rates, share = self._reach.rates(self._at, wanted)
         if share < 1.0:
-            bank.rows["status"][:] |= _SATURATED
+            self.bank.rows["status"][:] |= _SATURATED
         self._drive(rates)
         self._drives = True
+
+    def _end_reach(self, why: str, now_ns: int) -> None:
+        kind = self.bank.arrays["kind"]
+        going = np.flatnonzero((kind != HOLD) & (kind != STOP))
+        if going.size:
+            self.bank.abandon(going, now_ns, errno.ERANGE, f"the end of reach: {why}")
+
+    def _rests(self, now_ns: int) -> bool:
+        """Tell whether the held axes are to hold by themselves.
+
+        After a motion to its end the coordinates are driven for a while, which brings their error back. After a stop
+        nothing is brought back: they hold where they are, and the held axes brake what is left by themselves, at once.
+        """
+        bank, kind = self.bank, self.bank.arrays["kind"]
+        resting = (kind == HOLD) | (kind == SETTLING)
+        ended = np.flatnonzero(bank.stopped & resting)
+        if ended.size:
+            bank.stay(ended)
+            if resting.all():
+                return True
+        if not bank.is_idle(self._all) or bank.is_on_its_way():
+            self._moved_ns = now_ns
+        return bool(resting.all()) and not (self._drives and now_ns - self._moved_ns <= _SETTLE_NS)
 
     def _drive(self, rates: Sequence[float]) -> None:
         first = 0
@@ -410,9 +419,21 @@ class Compound(TickDriver):
                 most = float(loop["velocity_limit"][i])
                 found.append(min(max(rate, -most), most))
             else:
-                error = float(loop["desired"][i] - loop["position"][i])
-                found.append(float(loop["desired_velocity"][i]) + axis.gain * error)
+                speed, limit = float(loop["desired_velocity"][i]), float(loop["velocity_limit"][i])
+                most = max(limit * (1.0 + _SPARE * axis.watch.speed_margin), abs(speed))
+                found.append(min(max(speed + axis.gain * self._errors[i], -most), most))
         return found
+
+    def _follow(self, now_ns: int) -> None:
+        """Find the errors of the coordinates: where they were to be when they were read, minus where they were."""
+        loop, past = self.bank.arrays, self._set_points
+        wanted = self._raw(loop["desired"].tolist())
+        last_ns, last = past.last
+        most = _JUMP * loop["velocity_limit"] * (now_ns - last_ns) * 1e-9
+        if not last or (np.abs(np.subtract(wanted, last)) > most).any():
+            past = self._set_points = Past()  # it goes on from somewhere else
+        past.add(now_ns, wanted)
+        self._errors = [w - a for w, a in zip(past.at(self._block.stamp_ns), self._at, strict=True)]
 
     def pressing(self, index: int, wanted: float, now_ns: int) -> float:
         """Return the velocity of a coordinate that shall press with a force.

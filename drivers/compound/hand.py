@@ -94,10 +94,12 @@ from sioms.sdk.driver import Kit
 from sioms.sdk.inputs import NotMeasuredError
 
 from .compound import Compound, CompoundSettings
+from .readings import Reading
 
 D, PSI = COORDINATES.index("d"), COORDINATES.index("psi")
 _TH = (2, 5)
-_SHARE = 0.05  # of a new torque in the bend of a link: a servo that chases its encoder's steps does not shake d
+_BEND_S = 0.05
+"""Time constant of the bend of a link in its torque: a servo that chases its encoder's steps does not shake d [s]."""
 _INVALID = int(AnalogStatus.INVALID)
 _CHANNELS = (
     ("force", "N", "internal force, from what `squeeze` reads; positive squeezes"),
@@ -210,6 +212,7 @@ class HandDriver(Compound):
         self._was_ns = self._newest_ns = 0
         self._about: float | None = None  # d about which the spring yields
         self._bend = [0.0, 0.0]
+        self._bent_ns = 0
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -225,10 +228,13 @@ class HandDriver(Compound):
         if self._shown_force is not None:
             self._show(self._shown_force, now_ns, self._newest_ns != seen_ns)
 
-    def bent(self, joints: list[float], load: Sequence[float]) -> list[float]:
+    def bent(self, taken: Reading) -> list[float]:
         """Return the joints with the links turned by what their drives' torques bend them."""
+        joints, passed_s = taken.joints, (taken.stamp_ns - self._bent_ns) * 1e-9
+        self._bent_ns = taken.stamp_ns
+        share = 1.0 - math.exp(-passed_s / _BEND_S)
         for n, i in enumerate(_TH):
-            self._bend[n] += _SHARE * (load[i] / self.settings.link_stiffness - self._bend[n])
+            self._bend[n] += share * (taken.load[i] / self.settings.link_stiffness - self._bend[n])
             joints[i] -= self._bend[n]
         return joints
 

@@ -71,7 +71,8 @@ AWAY: Final = 4
 class Loop(Record):
     """The arrays of n axes, (n,) each unless it is said; lengths in the unit of the axis, times in s or ns.
 
-    Readings: ``measured`` and ``switches`` as they come; ``raw`` and ``last_raw`` of this tick and the last;
+    Readings: ``measured`` and ``switches`` as they come, taken at ``seen_ns``, which may be long before the tick, and
+    the same in several ticks; ``raw`` of this tick, ``last_raw`` of the last with a newer reading, taken at ``raw_ns``;
     ``position`` is raw + ``offset``; ``velocity`` filtered with the time constant ``filter_s``.
 
     Plans: ``present`` (6 n) coefficients of the polynomials, begun at ``segment_ns``; the next ends at ``next_ns``.
@@ -82,7 +83,7 @@ class Loop(Record):
     ``slewed``, ``anchor``, ``start_velocity``, ``last_velocity``; ``direction``, ``most``, ``asked``, ``presses`` of
     force_end.py; ``limp`` axes are let go.
 
-    Watch: see host_watch.py.
+    Watch: see host_watch.py; ``derived`` where the axes are made of others, which are watched themselves.
 
     Shown: ``desired``, ``desired_velocity``, ``following``, ``force``, ``status``, ``buffered``. Answer: ``actuator``.
     """
@@ -151,9 +152,12 @@ class Loop(Record):
     event_status: Integers
     waiting: Integers
     has_head: Flags
+    derived: int
     doubted: int
     any_odd: int
     bound: float
+    seen_ns: int
+    raw_ns: int
     before_ns: int
     watched_ns: int
     looked_ns: int
@@ -169,6 +173,8 @@ class Loop(Record):
     against: Floats
     fast: Integers
     off: Integers
+    heading: Integers
+    turned_ns: Integers
     since_ns: Integers
     odd: Integers
 
@@ -191,11 +197,15 @@ def take(a: Loop, now_ns: int) -> int:
 
 @step
 def watch(a: Loop, now_ns: int) -> int:
-    """Judge what has added up since the last look: ``odd`` of each axis; returns ODD when there is any."""
-    longest = (now_ns - a.earlier_ns) * 1e-9
-    a.looked_ns = now_ns
+    """Judge what has added up since the last look: ``odd`` of each axis; returns ODD when there is any.
+
+    All of it is judged by when the readings were taken, not by when they came.
+    """
+    seen_ns = a.seen_ns
+    longest = (seen_ns - a.earlier_ns) * 1e-9
+    a.looked_ns = seen_ns
     a.earlier_ns = a.watched_ns
-    a.due_ns = now_ns + LOOK_NS
+    a.due_ns = seen_ns + LOOK_NS
     found = 0
     for i in range(a.n):
         raw = a.raw[i]
@@ -210,19 +220,24 @@ def watch(a: Loop, now_ns: int) -> int:
         a.fast[i] = a.fast[i] + 1 if beyond > 0.0 else 0
         # an axis that settles, or is let go, may be anywhere
         if not holds or limp or not a.watched[i]:
-            a.since_ns[i] = now_ns
-        if now_ns - a.since_ns[i] <= SETTLE_NS:
+            a.since_ns[i] = seen_ns
+        if seen_ns - a.since_ns[i] <= SETTLE_NS:
             a.reference[i] = raw
         a.off[i] = a.off[i] + 1 if abs(raw - a.reference[i]) > a.tolerance[i] else 0
         commanded = a.desired_velocity[i]
-        along = way if commanded > 0.0 else (-way if commanded < 0.0 else 0.0)
+        heading = 1 if commanded > 0.0 else (-1 if commanded < 0.0 else 0)
+        if heading != a.heading[i]:
+            a.heading[i] = heading
+            a.turned_ns[i] = now_ns
+        # what was read before the last turn is no motion against what is commanded since
+        along = way * heading if seen_ns >= a.turned_ns[i] else 0.0
         a.against[i] = 0.0 if holds or limp or along >= 0.0 else a.against[i] - along
         odd = 0
         if a.fast[i] > 1 and a.excess[i] > JITTER_S * fastest:
             odd = odd | TOO_FAST
         if a.off[i] > 1:
             odd = odd | MOVED
-        if a.against[i] > AGAINST * a.tolerance[i]:
+        if a.against[i] > AGAINST * a.tolerance[i] and not a.derived:
             odd = odd | AWAY
         a.odd[i] = odd
         if odd:
@@ -233,9 +248,10 @@ def watch(a: Loop, now_ns: int) -> int:
 
 @step
 def looked_at(a: Loop, now_ns: int) -> int:
-    """Note that the watch has seen the readings of now."""
-    a.before_ns = a.watched_ns
-    a.watched_ns = now_ns
+    """Note that the watch has seen the readings."""
+    if a.seen_ns > a.watched_ns:
+        a.before_ns = a.watched_ns
+        a.watched_ns = a.seen_ns
     return 0
 
 
@@ -246,9 +262,13 @@ def begin_tick(a: Loop, now_ns: int) -> int:
     a.last_ns = now_ns
     dt = max((now_ns - a.previous_ns) * 1e-9, 0.1 * a.tick_s)
     a.dt = dt
+    if a.seen_ns <= a.raw_ns:
+        return 0
+    step_s = max((a.seen_ns - a.raw_ns) * 1e-9, 0.1 * a.tick_s)
+    a.raw_ns = a.seen_ns
     for i in range(a.n):
-        change = (a.raw[i] - a.last_raw[i]) / dt - a.velocity[i]
-        a.velocity[i] += change * (dt / (a.filter_s[i] + dt))
+        change = (a.raw[i] - a.last_raw[i]) / step_s - a.velocity[i]
+        a.velocity[i] += change * (step_s / (a.filter_s[i] + step_s))
         a.last_raw[i] = a.raw[i]
     return 0
 
@@ -389,9 +409,9 @@ def settle(a: Loop, i: int) -> int:
     speed = abs(a.output[i] if a.stepper[i] else a.velocity[i])
     limit = a.velocity_limit[i]
     if speed > REST * limit:
-        a.moved_ns[i] = a.last_ns
+        a.moved_ns[i] = a.seen_ns
     there = abs(a.error[i]) <= a.tolerance[i] and speed <= SLOW * limit and not a.limp[i]
-    a.settled[i] = there or a.last_ns - a.moved_ns[i] > REST_NS
+    a.settled[i] = there or a.seen_ns - a.moved_ns[i] > REST_NS
     return SETTLED if a.settled[i] else 0
 
 
@@ -455,6 +475,7 @@ def quiet_tick(a: Loop, now_ns: int) -> int:
         return LATE
     if now_ns >= a.next_ns:
         return ENDS
+    a.seen_ns = now_ns
     found = take(a, now_ns)
     if not found and now_ns >= a.due_ns:
         found = watch(a, now_ns)

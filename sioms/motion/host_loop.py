@@ -42,6 +42,8 @@ class AxisBank(Bank):
         late_max_s: a tick that comes later than this after its predecessor stops all motion [s].
         makes_up: tells whether late ticks are made up for, each at its own time, as those of a simulated device are;
             a verb then acts within a tick after the last, because the axes have come no further.
+        derived: the positions are made of those of other axes, whose own watch finds motors that run the wrong way; an
+            axis that is brought back from where these have come is none.
 
     ``arrays`` are those of the loop by name (``axis_step.Loop``), to be read.
     ``stepper`` (n,) tells which entries of tick()'s answer are raw output positions; the others are forces or torques.
@@ -61,6 +63,7 @@ class AxisBank(Bank):
         capacity: int = 16384,
         late_max_s: float = 0.05,
         makes_up: Callable[[], bool] = lambda: False,
+        derived: bool = False,
     ) -> None:
         super().__init__(settings, markers, capacity, passing=True)
         n = self.n
@@ -78,6 +81,7 @@ class AxisBank(Bank):
         )  # fmt: skip
         self.loop = self._law.loop
         self.loop.late_ns = self._late_ns = int(late_max_s * 1e9)
+        self.loop.derived = int(derived)
         self.stepper = self._law.stepper
         self._sequencer = Sequencer(
             settings, self._queue, store, self._law, self._arrivals, self._position, self._velocity, self._in_motion,
@@ -91,6 +95,7 @@ class AxisBank(Bank):
         self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
         self._any_limp = False
         self._tick_s, self._makes_up = tick_s, makes_up
+        self._again = False
 
     def plan_ahead(self, count: int = 32) -> int:
         """Plan up to ``count`` next commands (10 to 20 us each), in the slack between ticks.
@@ -99,6 +104,22 @@ class AxisBank(Bank):
             how many axes were looked at; 0 when there is nothing to do.
         """
         return self._sequencer.plan_ahead(count, self._last_ns)
+
+    @property
+    def stopped(self) -> NDArray[np.bool_]:
+        """Which axes have been stopped since their last command began, (n,)."""
+        return self._sequencer.stopped
+
+    def is_on_its_way(self) -> bool:
+        """Tell whether an axis whose set-point rests still moves, farther from there than the tolerance."""
+        rests = np.flatnonzero(np.isin(self._sequencer.kind, (HOLD, SETTLING)))
+        return bool(self._law.is_on_its_way(rests, self._desired[rests]).any())
+
+    def stay(self, axes: Axes) -> None:
+        """Have axes whose set-points rest hold where they are instead: nothing is brought back."""
+        self._law.give_way(axes)
+        self._sequencer.stay(axes, self._position[axes], self._last_ns)
+        self._desired[axes], self._desired_velocity[axes] = self._position[axes], 0.0
 
     # -- what the bank asks for ---------------------------------------------------------------
 
@@ -221,15 +242,25 @@ class AxisBank(Bank):
 
     # -- the tick -----------------------------------------------------------------------------
 
+    def believe(self) -> None:
+        """Take the next readings as the first: nothing is known of how the axes came from the last to there."""
+        self._again = True
+
     def tick(
-        self, now_ns: int, position: NDArray[np.float64], switches: NDArray[np.int64] | None = None
+        self,
+        now_ns: int,
+        position: NDArray[np.float64],
+        switches: NDArray[np.int64] | None = None,
+        seen_ns: int | None = None,
     ) -> NDArray[np.float64]:
         """Advance all axes to now and return what the actuators shall do.
 
         Args:
-            now_ns: instant at which the positions were measured [ns].
+            now_ns: instant of the tick [ns].
             position: measured raw positions (n,).
             switches: bits SWITCH_MINUS, SWITCH_PLUS, SWITCH_HOME of each axis (n,), or None.
+            seen_ns: instant at which the positions were measured [ns]; None: now. It may be that of the tick before:
+                nothing has been measured since.
 
         Returns:
             (n,) force or torque of servos, raw output position of steppers (see ``stepper``). The
@@ -241,6 +272,7 @@ class AxisBank(Bank):
         if now_ns - last_ns > self._late_ns:
             self._stop_late(last_ns, now_ns)
         self._measured[:] = position
+        loop.seen_ns = now_ns if seen_ns is None else seen_ns
         loop.has_switches = switches is not None
         if switches is not None:
             self._switches[:] = switches
@@ -250,7 +282,9 @@ class AxisBank(Bank):
             found = axis_step.take(loop, now_ns)
         if first:
             self._first_measurement(position, now_ns)
-        elif found or loop.any_odd or now_ns >= loop.due_ns:
+        elif self._again:
+            self._begin_to_watch()
+        elif found or loop.any_odd or loop.seen_ns >= loop.due_ns:
             self._look(now_ns)
         else:
             axis_step.looked_at(loop, now_ns)
@@ -332,7 +366,6 @@ class AxisBank(Bank):
 
     def _first_measurement(self, told: NDArray[np.float64], now_ns: int) -> None:
         self._seen = True
-        self._last_raw[:] = self._raw
         if self.keeper is not None:
             offset, homed = self.keeper.restored(told)
             self._offset[:] = offset
@@ -340,8 +373,13 @@ class AxisBank(Bank):
             self._queue.set_homed(np.flatnonzero(homed), True, now_ns)
         self._law.slewed[:] = self._position
         self._law.anchor[:] = self._offset
-        self._motion_watch.begin(now_ns)
+        self._begin_to_watch()
         self._sequencer.hold(np.arange(self.n), self._position, now_ns)
+
+    def _begin_to_watch(self) -> None:
+        self._again = False
+        self._last_raw[:], self.loop.raw_ns = self._raw, self.loop.seen_ns - round(self._tick_s * 1e9)
+        self._motion_watch.begin()
 
     def _refuse_measurement(self, now_ns: int) -> None:
         """Go on with what was read before where a reading is no number."""

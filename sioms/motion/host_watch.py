@@ -3,15 +3,16 @@
 The host knows in each tick where an axis should be, so less has to be reckoned with than of a drive that plans by
 itself. Looked at is the raw position. Found are
 
-* *lost*: a step between two ticks that no axis can make, and that stands in the next tick. What was seen once is not
+* *lost*: a step between two readings that no axis can make, and that stands in the next. What was seen once is not
   believed: one damaged reading must stop nothing.
 * *too fast*: as in watch.py: the distance covered beyond ``1 + speed_margin`` times velocity_max adds up.
 * *uncommanded*: an axis that has settled and holds is farther than ``tolerance`` from where it came to rest.
 * *away*: an axis runs against the velocity that is commanded: its motor or its encoder is connected the wrong way
     round.
 
-Steps are looked at in each tick; the rest every LOOK_S, and is a finding when it is seen twice. Why so:
-docs/decisions/0165-the-watch-of-host-closed-loops.md.
+Steps are looked at from each reading to the next; the rest every LOOK_S, and is a finding when it is seen twice. Time
+is that of the readings: one that comes late, or twice, is no step. Why so:
+docs/decisions/0165-the-watch-of-host-closed-loops.md, 0600-readings-are-judged-by-their-stamps.md.
 
 Pure; concurrency: that of its bank.
 """
@@ -66,23 +67,30 @@ class HostWatch:
         self._doubted: dict[int, tuple[float, int, float]] = {}
         """Where an axis was before a step that it cannot have made, when [ns], and how far it can have come."""
 
-    def begin(self, now_ns: int) -> None:
-        """Take the first readings."""
+    def begin(self) -> None:
+        """Take the first readings, or the first after some that tell nothing of what comes."""
         loop = self._loop
+        self._doubted.clear()
+        loop.doubted = loop.any_odd = 0
         self._place[:] = self._reference[:] = self._raw
-        self._since_ns[:] = now_ns
-        loop.before_ns = loop.watched_ns = loop.looked_ns = loop.earlier_ns = loop.due_ns = now_ns
+        for numbers in self._sums:
+            numbers[:] = 0
+        self._since_ns[:] = loop.seen_ns
+        loop.before_ns = loop.watched_ns = loop.looked_ns = loop.earlier_ns = loop.due_ns = loop.seen_ns
 
     def look(self, now_ns: int) -> list[Finding]:
         """Judge the readings of a tick.
 
         Args:
-            now_ns: time of the readings [ns].
+            now_ns: time of the tick [ns].
         """
         loop = self._loop
-        found = self._steps(now_ns, loop.watched_ns)
-        dt = (now_ns - loop.looked_ns) * 1e-9
-        if now_ns >= loop.due_ns and not self._doubted:
+        seen_ns = loop.seen_ns
+        if seen_ns <= loop.watched_ns:
+            return []  # they are those of the tick before
+        found = self._steps(seen_ns, loop.watched_ns)
+        dt = (seen_ns - loop.looked_ns) * 1e-9
+        if seen_ns >= loop.due_ns and not self._doubted:
             watch(loop, now_ns)
         if loop.any_odd:
             loop.any_odd = 0
@@ -91,35 +99,35 @@ class HostWatch:
                 for axis in np.flatnonzero(self._odd).tolist()
             ]
         for finding in found:
-            self._forget(finding.axis, now_ns)
+            self._forget(finding.axis, seen_ns)
         loop.doubted = len(self._doubted)
         looked_at(loop, now_ns)
         return found
 
-    def _forget(self, axis: int, now_ns: int) -> None:
+    def _forget(self, axis: int, seen_ns: int) -> None:
         """Judge an axis by what comes from now on: what it did has been told."""
         self._place[axis] = self._reference[axis] = self._raw[axis]
-        self._since_ns[axis] = now_ns
+        self._since_ns[axis] = seen_ns
         for numbers in self._sums:
             numbers[axis] = 0
 
     # -- steps --------------------------------------------------------------------------------
 
-    def _steps(self, now_ns: int, last_ns: int) -> list[Finding]:
-        """Doubt steps that are too wide, and say in the next tick what they were."""
+    def _steps(self, seen_ns: int, last_ns: int) -> list[Finding]:
+        """Doubt steps that are too wide, and say at the next reading what they were."""
         raw, last = self._raw, self._last
         found, fastest = [], self._factor * self._velocity
         # a reading may be as old as the last tick: what the device counts is then what it was told before
-        reach = fastest * (now_ns - self._loop.before_ns) * 1e-9 + self._tolerance
-        if now_ns - last_ns > GAP_NS:  # the readings were lost: what was held must read as before
+        reach = fastest * (seen_ns - self._loop.before_ns) * 1e-9 + self._tolerance
+        if seen_ns - last_ns > GAP_NS:  # the readings were lost: what was held must read as before
             held = (self._kind == HOLD) & ~self._limp & self._watched
             reach[held] = self._tolerance[held]
         wide = np.abs(raw - last) > reach
         for axis, (place, then_ns, most) in list(self._doubted.items()):
             del self._doubted[axis]
-            one, place_now, within_s = self._settings[axis], float(raw[axis]), (now_ns - then_ns) * 1e-9
+            one, place_now, within_s = self._settings[axis], float(raw[axis]), (seen_ns - then_ns) * 1e-9
             stands, wide[axis] = not wide[axis], False
-            if abs(place_now - place) <= most + fastest[axis] * (now_ns - last_ns) * 1e-9:
+            if abs(place_now - place) <= most + fastest[axis] * (seen_ns - last_ns) * 1e-9:
                 continue  # it reads again what it can be
             if stands:
                 found.append(Finding(axis, lost_text(one, place, place_now, within_s), lost=True))

@@ -123,9 +123,10 @@ class ControlLaw:
         position = np.where(stepper, self.slewed[axes], self._position[axes])
         return position, np.where(stepper, self.output[axes], self._velocity[axes])
 
-    def is_on_its_way(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
-        """Tell which axes move, and are far from their set-points or have been let go."""
-        on_its_way: NDArray[np.bool_] = (np.abs(self._error[axes]) > self._tolerance[axes]) | self.limp[axes]
+    def is_on_its_way(self, axes: NDArray[np.int64], rest: Vector) -> NDArray[np.bool_]:
+        """Tell which axes move, and are far from where their set-points rest (m,), or have been let go."""
+        error = np.where(self.stepper[axes], self._error[axes], rest - self._position[axes])
+        on_its_way: NDArray[np.bool_] = (np.abs(error) > self._tolerance[axes]) | self.limp[axes]
         return on_its_way & self.moves(axes)
 
     def moves(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:

@@ -59,7 +59,7 @@ _HOMING = int(AxisStatus.HOMING)
 class Sequencer:
     """Plans of n axes in time. Arrays (n,): ``kind`` of the running plan, ``guard`` where soft limits are
     watched in every tick, ``outcome`` LIMIT_* and MISSED_TARGET of the last motion, ``status`` and ``in_motion``
-    as they change with events.
+    as they change with events, ``stopped`` where the last motion has been broken off by a stop.
 
     Args:
         settings: one per axis.
@@ -93,6 +93,7 @@ class Sequencer:
         self.store = store
         self.kind, self.guard, self.status = law.kind, law.guard, law.event_status
         self.outcome = np.zeros(n, dtype=np.int64)
+        self.stopped = np.zeros(n, dtype=bool)
         self._velocity_limit, self._acceleration_limit = queue.in_force
         self.any_force = False
         self.any_guard = False
@@ -238,6 +239,12 @@ class Sequencer:
         self.store.put_hold(self.store.row[axes], position)
         self._run_now(axes, HOLD, start_ns)
 
+    def stay(self, axes: Axes, position: Floats, now_ns: int) -> None:
+        """Have axes that rest or settle rest at position instead."""
+        settling = axes[self.kind[axes] == SETTLING]
+        self.hold(axes, position, now_ns)
+        self._queue.emit(EventKind.IDLE, settling[self.is_idle(settling)], now_ns)
+
     def drive(self, axis: int, velocity: float, now_ns: int) -> None:
         """Go over to a velocity from the present state, outside the buffer and the soft limits (homing)."""
         one = np.array([axis])
@@ -251,6 +258,7 @@ class Sequencer:
 
     def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
         self._set_kind(axes, kind)
+        self.stopped[axes] = kind == STOP
         self._row_taken[self.store.row[axes]] = False
         self.store.begin(axes, np.full(axes.size, start_ns), np.zeros(axes.size))
         self._settle_masks()
@@ -400,6 +408,7 @@ class Sequencer:
         self.kind[axes] = self._row_kind[rows]
         self.guard[axes] = self._row_guard[rows]
         self.outcome[axes] = 0
+        self.stopped[axes] = False
         if self.arrivals.watched:
             self.arrivals.tries[axes] = 0
         self._todo.update(dict.fromkeys(axes.tolist()))
@@ -456,7 +465,8 @@ class Sequencer:
 
     def settle(self, axes: Axes, now_ns: int) -> None:
         """Of these axes, whose set-points rest, wait for those that are still on their way."""
-        settling = axes[(self.kind[axes] == HOLD) & self._law.is_on_its_way(axes)]
+        rest = self.store.final[self.store.row[axes], 0]
+        settling = axes[(self.kind[axes] == HOLD) & self._law.is_on_its_way(axes, rest)]
         if settling.size:
             self._set_kind(settling, SETTLING)
             self._law.moved_ns[settling] = now_ns

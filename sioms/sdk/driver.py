@@ -77,6 +77,10 @@ class InputNode(Protocol):
         """Instant before which everything shows in what was returned last [ns, CLOCK_MONOTONIC]."""
 
 
+class AtLimitError(OSError):
+    """A held axis was stopped at a limit of its own; it takes commands as before."""
+
+
 class HeldNode(Protocol):
     """An axis node of another device that is this device's own (``Description.holds``)."""
 
@@ -113,7 +117,7 @@ class HeldNode(Protocol):
 
     def trouble(self) -> OSError | None:
         """Return why it has not done as it was told since the last call: refused, stopped, in fault, gone; None: it
-        has.
+        has. AtLimitError when that is all it is.
         """
 
 

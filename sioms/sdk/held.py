@@ -21,6 +21,8 @@ from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import WRITE, WRITE_STRUCT
 from sioms.protocol.verbs import Ioctl, Keepalive, Message, Write
 
+from .driver import AtLimitError
+
 _RECORD = WRITE_STRUCT[NodeClass.AXIS]
 _NAMES = list(WRITE[NodeClass.AXIS])
 _VELOCITY = _NAMES.index("velocity")
@@ -56,6 +58,8 @@ class Held:
         self._number = 0
         self._watch = self._reset = self._driven = 0
         """Numbers of the wait for a stop by somebody, of the last reset, and of the command that is not answered."""
+        self._past_watches: set[int] = set()
+        """Numbers of waits that a stop of our own has ended, or is about to: how they end tells nothing any more."""
         self._wanted: Sequence[float] | None = None
         self._record: list[Any] = [0] * len(_NAMES)
         self._record[1] = _JOG
@@ -74,6 +78,7 @@ class Held:
         self._sock, self.channels, self._watch, self._reset, self.shows_reset_ns = None, (), 0, 0, 0
         self._driven, self._wanted = 0, None
         self._asked.clear()
+        self._past_watches.clear()
 
     @property
     def is_there(self) -> bool:
@@ -106,6 +111,8 @@ class Held:
 
     def stop(self) -> None:
         """Stop the axes at their greatest deceleration."""
+        if self._watch:
+            self._past_watches.add(self._watch)
         self._watch, self._wanted = 0, None
         self._send(Ioctl(int(Request.STOP), None, 0.0).packed(self._ask()))
 
@@ -142,7 +149,7 @@ class Held:
                 found = found or OSError(errno.EIO, f"{self.name}: its device does not serve it any more")
                 break
             error = self._answered(*decode_reply(packet))
-            found = found or error
+            found = error if found is None or isinstance(found, AtLimitError) else found
         if not self._driven:
             self._send_wanted()
         return found or self._silence()
@@ -164,6 +171,9 @@ class Held:
 
         What was asked for before the last reset tells nothing any more, and what a stop of our own ends is no trouble.
         """
+        if number in self._past_watches:
+            self._past_watches.discard(number)
+            return None
         watched = number == self._watch and number != 0
         if watched:
             self._watch = 0
@@ -173,6 +183,8 @@ class Held:
             self._driven = 0
         if number == self._reset:
             self.shows_reset_ns = as_of_ns
+        if watched and errno_ == errno.ERANGE:
+            return AtLimitError(errno_, str(value))
         if not errno_ or 0 < number < self._reset or (errno_ == errno.ECANCELED and number and not watched):
             return None
         return OSError(errno_, str(value))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import math
 import re
 from collections.abc import Sequence
@@ -14,9 +15,10 @@ import pytest
 from motion_rig import Markers, records
 
 from sioms.drivers.compound.slits import SlitsDriver
-from sioms.motion import CommandError
+from sioms.motion import CommandError, EventKind
 from sioms.protocol.flags import AnalogStatus, AxisStatus, ControlMode
 from sioms.protocol.nodeinfo import ChannelInfo
+from sioms.sdk.driver import AtLimitError
 from sioms.sdk.exchange import LinkError
 from sioms.sdk.inputs import Input
 
@@ -35,18 +37,23 @@ class Blades:
         self.at, self.rates, self.most, self.stamp_ns = [-0.1, 0.1], [0.0, 0.0], [1.0, 1.0], 0
         self.status = self.as_of_ns = self.shows_reset_ns = 0
         self.resets: list[int] = []
+        self.stops = 0
+        self.error: OSError | None = None
 
     def drive(self, velocities: Sequence[float]) -> None:
         self.rates = list(velocities)
 
     def stop(self) -> None:
-        self.rates = [0.0, 0.0]
+        self.rates = [0.0 for _ in self.rates]
+        self.stops += 1
 
     def reset(self, until_ns: int) -> None:
         self.resets.append(until_ns)
         self.shows_reset_ns = 2**62
 
-    def trouble(self) -> None: ...
+    def trouble(self) -> OSError | None:
+        error, self.error = self.error, None
+        return error
 
     def read(self, now_ns: int) -> Any:
         self.stamp_ns = self.as_of_ns = now_ns
@@ -91,10 +98,11 @@ def test_a_stop_begins_where_blocked_coordinates_are_and_not_where_their_set_poi
     assert ahead > 0.02 and slits.blades.rates[1] > 0.15  # it presses
     assert slits.driver.blocks[0].bank.rows["status"][0] & AxisStatus.SATURATED
     slits.bank.stop([0, 1], slits.now_ns)
-    stood = list(slits.blades.at)
-    slits.blades.most = [1.0, 1.0]  # what was in the way gives way
+    blades = slits.blades  # what they were told last lasts until the next tick
+    stood = [at + rate * TICK_NS * 1e-9 for at, rate in zip(blades.at, blades.rates, strict=True)]
+    blades.most = [1.0, 1.0]  # what was in the way gives way
     slits.run(1.0)
-    assert slits.blades.at == pytest.approx(stood, abs=1e-3)
+    assert blades.at == pytest.approx(stood, abs=1e-4)
 
 
 def test_a_stop_of_coordinates_that_follow_keeps_their_course() -> None:
@@ -105,6 +113,43 @@ def test_a_stop_of_coordinates_that_follow_keeps_their_course() -> None:
     began = slits.blades.at[1]
     slits.run(1.0)
     assert slits.blades.at[1] - began == pytest.approx(0.2**2 / (2 * 2.0), rel=0.15)
+
+
+def test_a_stop_ends_with_its_braking_and_brings_nothing_back() -> None:
+    slits = Slits(blades=[Late("minus", 3), Late("plus", 3)])
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.2), [0], slits.now_ns)
+    slits.run(0.4)
+    slits.bank.stop([0, 1], slits.now_ns)
+    slits.run(0.2 / 2.0 + 0.006)
+    assert [held.rates for held in slits.held] == [[0.0], [0.0]], "braked at 2 m/s^2, and no longer"
+    assert slits.bank.is_idle([0, 1]) and slits.bank.rows["following_error"] == pytest.approx(0.0, abs=1e-4)
+    stood = [held.at[0] for held in slits.held]
+    slits.run(0.5)
+    assert [held.at[0] for held in slits.held] == stood
+    assert [held.stops for held in slits.held] == [1, 1], "they hold by themselves, and are idle"
+
+
+def test_a_coordinate_that_is_stopped_alone_brings_nothing_back_while_another_moves() -> None:
+    slits = Slits(blades=[Late("minus", 3), Late("plus", 3)])
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.2), [0], slits.now_ns)
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.05), [1], slits.now_ns)
+    slits.run(0.4)
+    slits.bank.stop([0], slits.now_ns)
+    slits.run(0.2 / 2.0 + 0.03)
+    (minus,), (plus,) = (held.rates for held in slits.held)
+    assert 0.5 * (minus + plus) == pytest.approx(0.0, abs=1e-3) and plus - minus == pytest.approx(0.05, abs=1e-3)
+
+
+def test_a_held_axis_that_came_to_its_own_limit_sooner_than_foreseen_is_the_end_of_reach() -> None:
+    slits = Slits()
+    slits.bank.append(records(mode=ControlMode.VELOCITY, velocity=0.2), [0], slits.now_ns)
+    slits.run(0.2)
+    slits.bank.take_events()
+    slits.blades.error = AtLimitError(errno.ERANGE, "stopped at the limit of position")
+    slits.run(0.2)
+    (event,) = [event for event in slits.bank.take_events() if event.kind is EventKind.DROPPED]
+    assert event.errno == errno.ERANGE and "the end of reach: stopped at the limit" in event.text
+    assert slits.blades.rates == [0.0, 0.0] and not slits.bank.fault_text(0)
 
 
 def test_limits_that_cannot_be_are_refused_with_a_sentence() -> None:
@@ -210,7 +255,7 @@ def test_a_reset_is_of_what_the_held_axes_showed_while_all_was_halted_and_of_not
     assert not slits.bank.fault_text(0), "what is shown before the answer does not count"
     slits.blades.shows_reset_ns = slits.now_ns + 1
     slits.run(0.01)
-    assert "stopped or in fault" in slits.bank.fault_text(0), "it is stopped still, or again"
+    assert "blades: emergency stop" in slits.bank.fault_text(0), "it is stopped still, or again"
 
 
 class Late(Blades):
@@ -259,3 +304,52 @@ def test_a_stop_of_one_coordinate_halts_all_until_all_are_reset() -> None:
     slits.bank.reset([0, 1])
     slits.run(0.5)
     assert slits.blades.at == pytest.approx(stood, abs=1e-6), "nothing resumes"
+
+
+class Stalled(Late):
+    """A device that the machine keeps waiting: it shows nothing new, and afterwards all that it has done meanwhile."""
+
+    stalls = False
+
+    def read(self, now_ns: int) -> Any:
+        if not self.stalls:
+            self._reading = super().read(now_ns).copy()
+            self._as_of_ns = self.stamp_ns
+        self.stamp_ns = self.as_of_ns = self._as_of_ns
+        return self._reading
+
+
+@pytest.mark.parametrize("ms", [10, 100, 180])
+def test_a_held_device_that_is_stalled_and_comes_back_has_not_jumped_and_is_not_skewed(ms: int) -> None:
+    slits = Slits(blades=[Stalled("minus", 0), Stalled("plus", 1)])
+    slits.bank.append(records(mode=ControlMode.POSITION, position=0.3), [0], slits.now_ns)
+    slits.run(0.08)  # it accelerates still
+    for _ in range(3):
+        slits.held[0].stalls = True
+        slits.run(ms * 1e-3)
+        gap = slits.bank.rows["position"][1]
+        slits.held[0].stalls = False
+        slits.run(0.05)
+        assert not slits.bank.fault_text(0), slits.bank.fault_text(0)
+        assert gap == pytest.approx(0.2, abs=2e-3), "both blades are looked at as of one instant"
+        assert abs(slits.bank.rows["velocity"][0]) < 0.25
+    slits.run(3.0)
+    assert not slits.bank.fault_text(0), slits.bank.fault_text(0)
+    assert slits.bank.rows["position"][0] == pytest.approx(0.3, abs=1e-4)
+
+
+def test_what_held_axes_read_after_they_were_lost_is_believed() -> None:
+    slits = Slits()
+    slits.blades.status = int(AxisStatus.FAULT)
+    slits.run(0.01)
+    slits.now_ns += 2_000_000_000
+    slits.blades.at, slits.blades.status = [0.3, 0.5], 0
+    slits.driver.open()
+    slits.run(0.01)
+    slits.bank.reset([0, 1])
+    slits.blades.shows_reset_ns = 0
+    slits.run(0.01)
+    slits.blades.shows_reset_ns = 0
+    slits.run(0.1)
+    assert not slits.bank.rows["status"].any(), slits.bank.fault_text(0)
+    assert slits.bank.rows["position"] == pytest.approx([0.4, 0.2])

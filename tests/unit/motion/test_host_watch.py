@@ -137,3 +137,63 @@ def test_each_axis_is_judged_by_itself():
     rig.tick(100)
     assert rig.field("status", 0) & S.FAULT and not rig.field("status", 1) & S.FAULT
     assert "0.001 m is right" in rig.text
+
+
+class Delayed(Shoved):
+    """Axes whose readings come late, and are read twice, while ``stalled``: then all at once."""
+
+    stalled = False
+
+    def tick(self, ticks=1, **_):
+        for _ in range(ticks):
+            self.now_ns += self.tick_ns
+            if not self.stalled:
+                self.read, self.read_ns = self.raw.copy(), self.now_ns
+            output = self.bank.tick(self.now_ns, self.read, seen_ns=self.read_ns)
+            self.raw = self.plant(output, self.tick_ns * 1e-9)
+            self.bank.plan_ahead()
+
+
+@pytest.mark.parametrize("ms", [5, 50, 190, 350])
+def test_readings_that_come_late_and_twice_are_judged_by_when_they_were_taken(ms):
+    rig = Delayed(axis(following_error_max=10.0), late_max_s=10.0)
+    for velocity in (FAST, -FAST, 0.3 * FAST, 0.0):
+        rig.write(mode=MODE.VELOCITY, velocity=velocity, replace=True)
+        rig.tick(5)
+        rig.stalled = True
+        rig.tick(ms)
+        rig.stalled = False
+        rig.tick(400 if velocity else 5)
+        assert not rig.field("status") & S.FAULT, rig.text
+        assert abs(rig.field("velocity")) < 1.2 * FAST
+    rig.bank.stop([0], rig.now_ns)
+    rig.tick(SETTLED)
+    rig.stalled = True
+    rig.shove[0] = FAST
+    rig.tick(50)
+    rig.stalled = False
+    assert rig.ticks_to_fault() <= 50, "what moves all the same is found"
+
+
+def test_one_damaged_reading_that_is_read_again_and_again_stops_nothing():
+    rig = Delayed(axis(), late_max_s=10.0)
+    rig.shoved[0] += 0.3
+    rig.tick(2)
+    rig.stalled = True
+    rig.tick(30)
+    rig.shoved[0] -= 0.3
+    rig.tick()
+    rig.stalled = False
+    rig.tick(100)
+    assert not rig.field("status") & S.FAULT, rig.text
+
+
+def test_the_first_readings_after_a_loss_are_believed_where_that_is_said():
+    rig = rest()
+    rig.shoved[0] += 0.5
+    rig.raw[0] += 0.5
+    rig.bank.believe()
+    rig.tick(100)
+    assert not rig.field("status") & S.FAULT, rig.text
+    rig.shoved[0] += 0.5
+    assert rig.ticks_to_fault() <= 3

@@ -14,6 +14,7 @@ from sioms.protocol.flags import NodeClass, Request
 from sioms.protocol.messages import MAX_PACKET, refusal, reply
 from sioms.protocol.records import WRITE, WRITE_STRUCT
 from sioms.protocol.verbs import ON_HANDLE, Ioctl, Message, Write, take
+from sioms.sdk.driver import AtLimitError
 from sioms.sdk.held import Held
 
 MOST_NS = 100_000_000
@@ -114,6 +115,24 @@ def test_a_stop_by_somebody_ends_the_watch_with_its_reason(driver: Driver) -> No
     driver.sock.send(reply(requests[0][0], None, 1))  # type: ignore[index]
     driver.sock.send(refusal(requests[1][0], errno.ECANCELED, "stopped by eva"))  # type: ignore[index]
     assert "stopped by eva" in str(driver.held.trouble())
+
+
+def test_an_axis_that_was_stopped_at_its_own_limit_is_told_apart(driver: Driver) -> None:
+    driver.held.drive([1.0])
+    requests = [driver.take(), driver.take()]
+    driver.sock.send(refusal(requests[1][0], errno.ERANGE, "stopped at the limit"))  # type: ignore[index]
+    assert isinstance(driver.held.trouble(), AtLimitError)
+    driver.sock.send(refusal(requests[0][0], errno.ERANGE, "velocity 9"))  # type: ignore[index]
+    trouble = driver.held.trouble()
+    assert trouble is not None and not isinstance(trouble, AtLimitError), "a command that was refused is no end"
+
+
+def test_how_a_watch_ends_that_a_stop_of_our_own_has_ended_tells_nothing(driver: Driver) -> None:
+    driver.held.drive([1.0])
+    requests = [driver.take(), driver.take()]
+    driver.held.stop()
+    driver.sock.send(refusal(requests[1][0], errno.ERANGE, "stopped at the limit"))  # type: ignore[index]
+    assert driver.held.trouble() is None
 
 
 def test_refusals_from_before_a_reset_tell_nothing_and_its_own_does(driver: Driver) -> None:
