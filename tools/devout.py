@@ -53,7 +53,7 @@ def _work(words: Sequence[str]) -> None:
         raise UsageError(tokens.bad.partition(": ")[2])
     cell = Workcell(name="devout")
     lease_s = line.common.get("lease", FROZEN_S)
-    nodes = [open_node(cell, t.name, "rw", lease_s=lease_s) for t in line.targets]
+    nodes = [open_node(cell, t.name, "rw", lease_s=lease_s, first=not i) for i, t in enumerate(line.targets)]
     keep_together(nodes)
     columns = [Columns(t, n.info) for t, n in zip(line.targets, nodes, strict=True)]
     repeats = "r" in line.common or "L" in line.common

@@ -119,7 +119,13 @@ def names_of(word: str) -> list[str]:
     return [name]
 
 
-def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False, lease_s: float = 0.0) -> Any:
+NO_NUMBER = "nor is it a number, which begins with a digit, a sign or a point"
+"""What is said of a word beside nodes and numbers that is neither."""
+
+
+def open_node(
+    cell: Workcell, word: str, mode: str, *, companion: bool = False, lease_s: float = 0.0, first: bool = True
+) -> Any:
     """Open the node that a word names.
 
     Args:
@@ -128,11 +134,17 @@ def open_node(cell: Workcell, word: str, mode: str, *, companion: bool = False, 
         mode: 'r' or 'rw'.
         companion: open its read-only companion where it has one, so that nobody is disturbed.
         lease_s: longest silence before its axes are halted [s]; 0: none.
+        first: where it is not the first word of its command line, it may have been meant as a number.
 
     Raises:
         OSError: it cannot be opened; of several names tried the error of the first.
     """
-    return by_any_name(word, lambda name: cell.open(name, mode, lease=lease_s), companion=companion)
+    try:
+        return by_any_name(word, lambda name: cell.open(name, mode, lease=lease_s), companion=companion)
+    except OSError as error:
+        if first or error.errno != errno.ENOENT:
+            raise
+        raise OSError(errno.ENOENT, f"{error.strerror}; {NO_NUMBER}") from None
 
 
 def by_any_name(word: str, act: Callable[[str], Any], *, companion: bool = False) -> Any:

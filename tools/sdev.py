@@ -12,7 +12,7 @@ from sioms.client.workcell import Workcell
 from sioms.protocol.flags import NodeClass
 
 from .options import Line, Target, UsageError, fold
-from .pipe import READONLY, by_any_name, complain, open_node, read_input, run
+from .pipe import NO_NUMBER, READONLY, by_any_name, complain, open_node, read_input, run
 from .tokens import Tokens
 
 TYPE_CHECKING = False
@@ -54,9 +54,10 @@ def _check(line: Line) -> None:
         raise UsageError("no device given; only -e works without one: it stops the whole workcell")
     if line.targets and line.trailing:
         raise UsageError(f"-{next(iter(line.trailing))} applies to the device that follows it, and none follows")
-    for target in line.targets:
+    for i, target in enumerate(line.targets):
         if not target.flags:
-            raise UsageError(f"{target.name}: nothing to do; an option applies to the device that follows it")
+            word = f"; {NO_NUMBER}" if i else ""
+            raise UsageError(f"{target.name}: nothing to do; an option applies to the device that follows it{word}")
 
 
 def _stop(cell: Workcell, line: Line) -> None:
