@@ -137,7 +137,7 @@ def test_unknown_node(shell: Shell) -> None:
     for line in ("devin mod9", "devout mod9 1", "sdev -w mod9", "sioms info mod9"):
         refused(shell(line), "mod9: no such node; did you mean mod")
     refused(shell("devout mod0.xaxis abc"), "abc: no such node", "nor is it a number")
-    refused(shell("sdev -c mod0.xaxis 0,1 abc"), "abc: nothing to do", "nor is it a number", status=2)
+    refused(shell("sdev -c mod0.xaxis 0.1 abc"), "abc: nothing to do", "nor is it a number", status=2)
 
 
 def test_a_held_node_names_its_holder_and_can_be_read(
