@@ -50,6 +50,10 @@ BENCHES: dict[str, tuple[str, str]] = {
         "killing",
         "processes killed and stopped at random points, alone and together: --trials N kills",
     ),
+    "compounds": (
+        "compounds",
+        "the same round a device made of devices: its client, its driver, what it holds: --trials N rounds",
+    ),
     "fuzz": (
         "fuzzing",
         "malformed frames and files: to each decoder, and on the sockets of daemon and drivers",

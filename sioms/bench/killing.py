@@ -139,12 +139,12 @@ def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> No
         time.sleep(chance.random() * 0.001)
         victims = chance.sample(sorted(clients), len(clients) if "clients" in kind else kind.count("client"))
         drivers = chance.sample(DEVICES, 2 if "two" in kind else kind.count("driver"))
-        servers = _fork_servers(daemon, set(pids.values())) if "fork server" in kind else []
+        servers = fork_servers(daemon, set(pids.values())) if "fork server" in kind else []
         driver_signal = signal.SIGSTOP if kind == "driver stopped" else signal.SIGKILL
         acts = [(clients[axis], signal.SIGSTOP if stops else signal.SIGKILL, axis) for axis in victims]
         acts += [(pids[name], driver_signal, "") for name in drivers] + [(pid, signal.SIGKILL, "") for pid in servers]
         chance.shuffle(acts)
-        begins = _send([(pid, how) for pid, how, _ in acts], chance, tally)
+        begins = send([(pid, how) for pid, how, _ in acts], chance, tally)
         begin_of = {axis: begin for (_, _, axis), begin in zip(acts, begins, strict=True)}
         for axis in victims:
             device, _, number = axis.partition(".a")
@@ -155,7 +155,7 @@ def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> No
             daemon.kill(pid)
             daemon.reap(pid)
         for name in drivers:
-            wait_for(partial(_is_back, daemon, cell, name, pids[name]), 60.0, f"{name} to be back")
+            wait_for(partial(is_back, daemon, cell, name, pids[name]), 60.0, f"{name} to be back")
         _judge(cell, stopped, tally)
 
 
@@ -274,7 +274,7 @@ def _refuses(node: Any) -> bool:
     return False
 
 
-def _is_back(daemon: Daemon, cell: Any, name: str, before: int) -> bool:
+def is_back(daemon: Daemon, cell: Any, name: str, before: int) -> bool:
     device = next(d for d in cell.status()["devices"] if d["name"] == name)
     if device["state"] == "fault":  # it has died too often in short time
         cell.reset(name)
@@ -294,13 +294,13 @@ def _end(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
     nodes, clients = _set_going(daemon, cell, chance)
     watches = {name: Watch(node) for name, node in nodes.items()}
     pids = daemon.device_pids()
-    servers = _fork_servers(daemon, set(pids.values()))
+    servers = fork_servers(daemon, set(pids.values()))
     others = {"client": [clients["mod0.a0"]], "driver": [pids["mod0"]], "server": servers}.get(kind.split()[-1], [])
     nodes["mod2"].emergency_stop()
     how = signal.SIGSTOP if kind == "daemon stopped" else signal.SIGKILL
     acts = [(daemon.pid, how), *((pid, signal.SIGKILL) for pid in others)]
     chance.shuffle(acts)
-    begin = _send(acts, chance, tally)[acts.index((daemon.pid, how))]
+    begin = send(acts, chance, tally)[acts.index((daemon.pid, how))]
     what = "daemon stopped" if how is signal.SIGSTOP else "daemon killed"
     for name in ("mod1",) if "driver" in kind else ("mod0", "mod1"):
         for axis in range(AXES):
@@ -347,13 +347,13 @@ def _weight(daemon: Daemon) -> dict[str, int]:
     return weight | {f"descriptors of {name}": descriptors(pid) for name, pid in drivers.items()}
 
 
-def _fork_servers(daemon: Daemon, drivers: set[int]) -> list[int]:
+def fork_servers(daemon: Daemon, drivers: set[int]) -> list[int]:
     """Return the fork server, if there is one: after its death one is started when it is needed."""
     children = Path(f"/proc/{daemon.pid}/task/{daemon.pid}/children").read_text().split()
     return [int(pid) for pid in children if int(pid) not in drivers]
 
 
-def _send(acts: Sequence[tuple[int, signal.Signals]], chance: random.Random, tally: Tally) -> list[int]:
+def send(acts: Sequence[tuple[int, signal.Signals]], chance: random.Random, tally: Tally) -> list[int]:
     """Send signals within a millisecond; return when each was sent [ns].
 
     If we may, we and the victims go before other work on the machine: who dies needs a processor to end on.
