@@ -8,8 +8,6 @@ from __future__ import annotations
 import errno
 
 from sioms.client.stopping import emergency_stop
-from sioms.client.workcell import Workcell
-from sioms.protocol.flags import NodeClass
 
 from .options import Line, Target, UsageError, fold
 from .pipe import NO_NUMBER, READONLY, by_any_name, complain, open_node, read_input, run
@@ -19,6 +17,8 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Sequence
     from typing import Any
+
+    from sioms.client.workcell import Workcell
 
 _COMPANION = "sw"  # requests that need no ownership go through the read-only companion
 
@@ -40,6 +40,8 @@ def _work(words: Sequence[str]) -> None:
         if unheard := emergency_stop("sdev -e", name="sdev"):
             complain("sdev", f"stopped and latched by the drivers; {unheard}", 0)
         return
+    from sioms.client.workcell import Workcell  # not before a stop of the workcell
+
     cell = Workcell(name="sdev")
     _stop(cell, line)
     if "t" in line.common and not any("w" in target.flags for target in line.targets):
@@ -112,6 +114,8 @@ class Setter:
     def _take(self, node: Any, key: str) -> list[float]:
         """Take the numbers that a request needs."""
         node_class = node.info.node_class
+        from sioms.protocol.flags import NodeClass
+
         wanted = NodeClass.ANALOG if key == "g" else NodeClass.AXIS
         if key != "z" and node_class is not wanted:
             raise UsageError(

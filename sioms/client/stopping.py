@@ -1,4 +1,7 @@
-"""The emergency stop of the workcell, whether or not the daemon answers."""
+"""The emergency stop of the workcell, whether or not the daemon answers.
+
+Drivers brake before the client library is imported: ``sdev -e`` is started for that.
+"""
 
 from __future__ import annotations
 
@@ -8,8 +11,6 @@ from time import monotonic, monotonic_ns, sleep
 
 from sioms.protocol.socketpath import cell_address
 from sioms.protocol.stopfile import StopRequest, open_stop_request
-
-from .workcell import Workcell
 
 TAKEN_S = 1.0
 """How long drivers may take to obey [s]; the slowest ticks are far shorter."""
@@ -32,11 +33,13 @@ def emergency_stop(why: str = "", path: str | None = None, name: str | None = No
     path = path or cell_address()
     request = None if "://" in path else open_stop_request(path)
     try:
+        word = 0 if request is None else request.request(monotonic_ns(), os.getpid(), why)  # heard within a tick
+        from .workcell import Workcell
+
         if request is None:
             with Workcell(path, name) as cell:
                 cell.emergency_stop(why=why)
             return ""
-        word = request.request(monotonic_ns(), os.getpid(), why)  # first: it is heard within a tick
         try:
             with Workcell(path, name, enough=lambda: request.taken(word)) as cell:
                 cell.emergency_stop(why=why)  # the daemon knows who it was
