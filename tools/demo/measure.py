@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import time
@@ -163,17 +164,25 @@ def _first_slower(node: Any, velocity: float, after_ns: int) -> int:
     raise RuntimeError(f"{node.name} did not slow down in {PATIENCE_S:g} s")
 
 
-def wait_for_rest(*nodes: Any) -> None:
+def wait_for_rest(*nodes: Any, slower_than: float = math.inf) -> None:
     """Wait until no axis of some nodes is in motion any more.
+
+    Args:
+        nodes: open axis nodes.
+        slower_than: measured velocity below which an axis that has arrived counts as resting [unit/s].
 
     Raises:
         RuntimeError: some are still, after ``PATIENCE_S``.
     """
     deadline = time.monotonic() + PATIENCE_S
-    while moving := [node.name for node in nodes if any(node.read().in_motion)]:
+    while moving := [node.name for node in nodes if _moves(node.read(), slower_than)]:
         if time.monotonic() > deadline:
             raise RuntimeError(f"{', '.join(moving)} did not come to rest in {PATIENCE_S:g} s")
         time.sleep(0.001)
+
+
+def _moves(reading: Any, slower_than: float) -> bool:
+    return any(reading.in_motion) or any(abs(v) >= slower_than for v in reading.velocity)
 
 
 def _timed(action: Callable[[], object], trials: int) -> list[float]:

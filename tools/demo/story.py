@@ -20,6 +20,9 @@ from .pace import RATES, paced, rate_for, share
 from .recorder import Recorder
 from .rig import bold, tool, waiting
 
+STILL = 1e-3
+"""Measured velocity below which an axis whose motion has ended is told to be at rest [m/s]."""
+
 
 def tell(out: str, quick: bool, wire: bool) -> int:
     """Run the demo; return the exit status."""
@@ -282,7 +285,7 @@ class _Show:
                 _say(f"before: {error.strerror}")
             self._note("SIGKILL to the client", victim.kill())
             with waiting("the axis of the killed client to come to rest"):
-                measure.wait_for_rest(watch)
+                measure.wait_for_rest(watch, slower_than=STILL)
             reading = watch.read()[0]
             self._note(f"axis at rest: {abs(reading.velocity):.4f} m/s")
             with waiting("mod0.xaxis to be free"):
