@@ -99,7 +99,8 @@ from .readings import Reading
 D, PSI = COORDINATES.index("d"), COORDINATES.index("psi")
 _TH = (2, 5)
 _BEND_S = 0.05
-"""Time constant of the bend of a link in its torque: a servo that chases its encoder's steps does not shake d [s]."""
+"""Time constant of the bend of a link in its torque, in the hand's own time [s]: a servo that chases its encoder's
+steps does not shake d."""
 _INVALID = int(AnalogStatus.INVALID)
 _CHANNELS = (
     ("force", "N", "internal force, from what `squeeze` reads; positive squeezes"),
@@ -232,7 +233,7 @@ class HandDriver(Compound):
         """Return the joints with the links turned by what their drives' torques bend them."""
         joints, passed_s = taken.joints, (taken.stamp_ns - self._bent_ns) * 1e-9
         self._bent_ns = taken.stamp_ns
-        share = 1.0 - math.exp(-passed_s / _BEND_S)
+        share = 1.0 - math.exp(-passed_s * self.settings.pace / _BEND_S)
         for n, i in enumerate(_TH):
             self._bend[n] += share * (taken.load[i] / self.settings.link_stiffness - self._bend[n])
             joints[i] -= self._bend[n]

@@ -44,7 +44,12 @@ def test_a_child_ends_with_a_parent_that_is_killed() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
 def test_a_command_that_is_told_to_end_puts_things_in_order(number: signal.Signals) -> None:
-    with subprocess.Popen([sys.executable, "-c", COMMAND], stdout=subprocess.PIPE, text=True) as command:
+    kept = signal.signal(number, signal.SIG_DFL)  # what nohup ignores, its commands go on ignoring
+    try:
+        command = subprocess.Popen([sys.executable, "-c", COMMAND], stdout=subprocess.PIPE, text=True)
+    finally:
+        signal.signal(number, kept)
+    with command:
         assert command.stdout is not None and command.stdout.readline() == "ready\n"
         command.send_signal(number)
         assert (command.stdout.read(), command.wait(30.0)) == ("in order\n", 128 + number)

@@ -22,6 +22,8 @@ SHOWN = {
     "sioms/client/certificates.py": "whether a certificate has expired, to say so; TLS judges by itself",
     "sioms/client/wall.py": "the wall clock of a reading, for who asks for it",
     "sioms/gateway/certificates.py": "from when until when a certificate is valid",
+    "sioms/reconcile/live/watch.py": "since when an axis drifts, as text",
+    "sioms/reconcile/report/watch.py": "since when an axis drifts, as text",
     "sioms/recording": "the names and the beginning of recordings",
     "sioms/sdk/stops.py": "since when something has been stopped",
     "tools": "what a person reads",

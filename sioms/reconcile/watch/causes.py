@@ -17,7 +17,7 @@ from .normal import ALL_NAMES, PLACE, PLAY, SCALE, TOTAL, UNKNOWN, Estimate, Nor
 from .rows import CONSTANT, DRY, GAP, GIVE, LAG, MASS, PLAYS, SIZE, VISCOUS
 
 #: Energy of a change in units of its variance above which there is one.
-CLEAR = 30.0
+CHANGED = 30.0
 #: What a named cause may leave, and by how much more every other must leave.
 LEFT, RIVAL = 25.0, 16.0
 #: A second direction is needed where it explains so much more.
@@ -100,7 +100,7 @@ class Finding:
     """What some blocks say against what is normal.
 
     Attributes:
-        gain: energy of the change along the best cause, in units of its variance; above CLEAR there is one.
+        gain: energy of the change along the best cause, in units of its variance; above CHANGED there is one.
         names: of causes that explain it: one is a name, several are an open question, none: no known cause.
         size, low, high: of the first one.
         change: of all numbers, shape (TOTAL,).
@@ -120,7 +120,7 @@ class Finding:
     @property
     def is_drift(self) -> bool:
         """Whether something has changed."""
-        return self.gain > CLEAR
+        return self.gain > CHANGED
 
 
 def judge(normal: Normal, now: Estimate, travel: float) -> Finding:

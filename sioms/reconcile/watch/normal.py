@@ -31,7 +31,7 @@ LOADS = 0.03
 #: What varies in commissioning may vary by so many times as much (in variance): it has not seen everything.
 UNSEEN = 1.5
 #: Neighbouring rows and the model's own errors leave fewer independent rows than there are: at least so many times.
-ALIKE = 2.0
+DEPENDENT = 2.0
 #: A variance beyond all: the number is not known.
 UNKNOWN = 1e12
 #: Crossings within this share of the travel are of one edge.
@@ -106,7 +106,7 @@ def estimate(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatt
         at = np.arange(SIZE)
         theta[:SIZE] = found
     left = left / max(rows - SIZE, 1)
-    cover[np.ix_(at, at)] = max(noise, ALIKE * left) * inverse
+    cover[np.ix_(at, at)] = max(noise, DEPENDENT * left) * inverse
     _refer(blocks, edges, scatter, theta, cover)
     return Estimate(theta, cover, left, gram, rows)
 
@@ -195,7 +195,7 @@ def _noise(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter
         change = (two.theta - one.theta)[:GAP]
         expected = (np.diag(one.noise) + np.diag(two.noise))[:GAP]
         ratios.append(change[1:4] ** 2 / np.maximum(expected[1:4], 1e-300))
-    return ALIKE * left * max(1.0, float(np.median(ratios)) / 0.45)  # the median of a squared normal deviate
+    return DEPENDENT * left * max(1.0, float(np.median(ratios)) / 0.45)  # the median of a squared normal deviate
 
 
 def _own(
