@@ -509,7 +509,7 @@ class WorkcellVerbs(Generic[M]):
             OSError: ENOENT, no such node; EPERM, without the right to write or to administer it; EINVAL, anything
                 else that is no such alarm.
         """
-        await self._ask(f"tell an alarm of {node}", verbs.TellAlarm(node, what, int(severity), printable(text, 300)))
+        await self._ask(f"tell an alarm of {node}", verbs.TellAlarm(node, what, severity, printable(str(text), 300)))
 
     @verb
     async def reload(self) -> None:

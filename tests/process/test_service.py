@@ -211,7 +211,7 @@ def test_sighup_reloads(start_daemon: Callable[..., Daemon]) -> None:
     daemon.configure("[device.io0]\n")
     daemon.running.signal(signal.SIGHUP)
     daemon.said("event=reload errors=1")
-    assert pids(daemon).keys() == {"io0", "io1"}
+    wait_for(lambda: pids(daemon).keys() == {"io0", "io1"}, "the new io1 in the place of the old, which ends first")
 
 
 def test_holders_of_a_changed_device_are_told(start_daemon: Callable[..., Daemon]) -> None:

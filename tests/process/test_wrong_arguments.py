@@ -23,7 +23,7 @@ GOOD: dict[str, Any] = {
     "position": 0.0, "velocity": 0.0, "step": 0.0, "user": 0.0, "after": 0, "request": Request.GET_LIMITS, "which": 0,
     "records": sioms.command(position=0.0), "values": 0.0, "every": 0, "name": "mod0.readonly", "token": 1, "number": 1,
     "count": 1, "handle": 0, "axis": 0, "last": 0, "gains": [1.0], "positions": 0.0, "nodes": None,
-    "level": "warning", "text": "a word", "lease": 1.0,
+    "level": "warning", "text": "a word", "lease": 1.0, "node": "mod0.xaxis", "what": "drift", "severity": 0,
 }  # fmt: skip
 """What the other parameters of a verb get."""
 NO_NUMBER: list[Any] = ["1", [], {}, True, object(), b"x", 1j, [1.0]]
