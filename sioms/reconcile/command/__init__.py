@@ -143,8 +143,18 @@ def reconcile(args: argparse.Namespace, subject: Subject, say: Say) -> int:
         seconds = time.monotonic() - began
     _write(args, subject, verdict, seconds)
     if node and args.install is not None:
-        print(subject.install(args, verdict))
+        print(installed(args, subject, verdict))
     return EXIT[verdict.outcome]
+
+
+def installed(args: argparse.Namespace, subject: Subject, verdict: Any) -> str:
+    """Install the corrected model, unless something that has no name remains; return a sentence on what was done."""
+    from sioms.reconcile.verdict import Outcome
+
+    if verdict.outcome in (Outcome.NAMED, Outcome.NONE):
+        return subject.install(args, verdict)
+    left = f"{args.install} is as it was, and what was found is in {args.out}"
+    return f"not installed: the verdict is {verdict.outcome.value}; {left}"
 
 
 def described(data: Path, out: Path | None) -> int:

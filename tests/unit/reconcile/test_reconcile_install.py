@@ -1,0 +1,25 @@
+"""What is put to work is a model that explains its machine."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from sioms.reconcile.command import installed
+from sioms.reconcile.verdict import Outcome
+
+
+@pytest.mark.parametrize("outcome", Outcome)
+def test_a_model_with_a_remainder_without_a_name_is_not_installed(outcome: Outcome) -> None:
+    done: list[Any] = []
+    subject: Any = SimpleNamespace(install=lambda _, verdict: done.append(verdict) or "model installed")
+    verdict = SimpleNamespace(outcome=outcome)
+    said = installed(argparse.Namespace(install=Path("twin.toml"), out=Path("report")), subject, verdict)
+    if outcome in (Outcome.NAMED, Outcome.NONE):
+        assert (done, said) == ([verdict], "model installed")
+    else:
+        assert not done and f"not installed: the verdict is {outcome.value}" in said
