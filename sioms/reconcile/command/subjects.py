@@ -82,9 +82,12 @@ def _axis_arguments(parser: argparse.ArgumentParser) -> Any:
 
 def _analyse_axis(args: Args, say: Say) -> Any:
     from sioms.reconcile.axis import analyse
+    from sioms.reconcile.errors import BadInputError
     from sioms.reconcile.files.axis import read_data, read_model
     from sioms.reconcile.prepare import Options
 
+    if not args.data.exists():
+        raise BadInputError(f"read {args.data}: no such file or folder")
     nominal = read_model(args.model or args.data / "nominal.json")
     session = read_data(args.data, nominal, args.columns)
     with ThreadPoolExecutor(args.jobs or os.cpu_count() or 1) as pool:
