@@ -18,14 +18,14 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser(
         "alarms",
         help="list alarms; acknowledge them",
-        description="List the alarms that are active, and those that are over and that nobody has acknowledged.",
+        description="List active alarms, and past alarms that have not been acknowledged.",
     )
-    parser.add_argument("--json", action="store_true", help="as JSON")
+    parser.add_argument("--json", action="store_true", help="print JSON")
     actions = parser.add_subparsers(dest="action", metavar="ACTION")
-    one = actions.add_parser("ack", help="acknowledge alarms in one's own name; a stop stays until it is reset")
+    one = actions.add_parser("ack", help="acknowledge alarms under your own name; does not reset a stop")
     one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes or devices, with all their parts")
-    one.add_argument("-a", "--all", action="store_true", help="all alarms on which one has the right")
-    one.add_argument("-m", "--message", metavar="TEXT", default="", help="what to tell others")
+    one.add_argument("-a", "--all", action="store_true", help="all alarms that you may acknowledge")
+    one.add_argument("-m", "--message", metavar="TEXT", default="", help="a note for others")
 
 
 def run(args: argparse.Namespace) -> int:

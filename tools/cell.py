@@ -20,15 +20,17 @@ from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 def add_parser(subparsers: Any) -> None:
     """Add the commands of this module."""
     one = subparsers.add_parser("list", help="list the nodes of the workcell")
-    one.add_argument("-v", "--verbose", action="store_true", help="also channels, bits and read-only companions")
-    one.add_argument("--names", action="store_true", help="only names, one per line; nothing if no daemon is running")
-    one.add_argument("--json", action="store_true", help="as JSON")
-    one.add_argument("--all", action="store_true", help="of all cells of the fleet, as CELL:NODE")
+    one.add_argument("-v", "--verbose", action="store_true", help="include channels, bits and read-only companions")
+    one.add_argument(
+        "--names", action="store_true", help="print names only, one per line; nothing if no daemon is running"
+    )
+    one.add_argument("--json", action="store_true", help="print JSON")
+    one.add_argument("--all", action="store_true", help="nodes of all cells of the fleet, as CELL:NODE")
     one = subparsers.add_parser("info", help="describe a node: channels, units, limits")
     one.add_argument("node", metavar="NODE")
-    one.add_argument("--json", action="store_true", help="as JSON")
+    one.add_argument("--json", action="store_true", help="print JSON")
     one = subparsers.add_parser("status", help="print the state of devices, sessions and the emergency stop")
-    one.add_argument("--json", action="store_true", help="as JSON")
+    one.add_argument("--json", action="store_true", help="print JSON")
     subparsers.add_parser("reload", help="make the daemon reload its configuration")
     one = subparsers.add_parser("stop", help="emergency stop, latched until `sioms reset`; not a safety-rated function")
     one.add_argument("node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell")

@@ -26,7 +26,7 @@ def add_parser(subparsers: Any) -> None:
     actions = subparsers.add_parser("driver", help="list and check drivers, record and replay their lines")
     actions = actions.add_subparsers(dest="action", metavar="ACTION", required=True)
     one = actions.add_parser("list", help="list the installed drivers")
-    one.add_argument("--json", action="store_true", help="as JSON")
+    one.add_argument("--json", action="store_true", help="print JSON")
     one = actions.add_parser("check", help="test drivers with noise, loss, unplugging, stops and process deaths")
     one.add_argument("drivers", metavar="DRIVER", nargs="*", help="registered name, register map, or a Python file")
     one.add_argument("--all", action="store_true", help="all shipped drivers and register maps")

@@ -35,7 +35,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     one = subparsers.add_parser("init", help="write a starter configuration")
     one.description = (
-        "Writes a configuration to begin with: simulated devices that work at once, and a block for everything that is "
+        "Writes a starter configuration: simulated devices that work immediately, and a block for everything that is "
         "plugged "
         "in, as a comment unless its USB identity leaves no doubt. With --driver the device is a real one instead."
     )

@@ -48,7 +48,7 @@ _SCROLL = {"\x1b[A": -1, "k": -1, "\x1b[B": 1, "j": 1, "\x1b[5~": -10, "\x1b[6~"
 def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser("monitor", help="display all nodes live; stop, reset and jog by key")
-    parser.add_argument("nodes", metavar="NODE", nargs="*", help="only these (default: all)")
+    parser.add_argument("nodes", metavar="NODE", nargs="*", help="nodes to display (default: all)")
 
 
 def run(args: argparse.Namespace) -> int:

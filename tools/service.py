@@ -74,8 +74,8 @@ def add_parser(subparsers: Any) -> None:
     parser = subparsers.add_parser("service", help="install the daemon as a service of this machine")
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True)
     for name, text in (
-        ("install", "put everything in place"),
-        ("remove", "take it away again, but the configuration"),
+        ("install", "install all files"),
+        ("remove", "remove all files except the configuration"),
     ):
         one = actions.add_parser(name, help=text)
         one.add_argument(

@@ -24,13 +24,13 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "supervise",
-        help="be the supervisor without whom the cells of a fleet stop",
-        description="Supervises every cell of the fleet until it is ended. Cells whose configuration has "
+        help="supervise the cells of a fleet, which stop without a supervisor",
+        description="Supervises every cell of the fleet until interrupted. Cells whose configuration has "
         "supervisor_lease_s stop when no supervisor is left; `sioms reset` clears that, with one present.",
     )
     parser.add_argument("--fleet", metavar="FILE", default="", help="default: $SIOMS_FLEET, or the user's own")
     parser.add_argument(
-        "--lease", metavar="SECONDS", type=positive, default=LEASE_S, help="longest silence; default 1 s"
+        "--lease", metavar="SECONDS", type=positive, default=LEASE_S, help="time-out of supervision; default 1 s"
     )
 
 

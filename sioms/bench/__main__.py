@@ -10,7 +10,7 @@ from .command import add_arguments, run
 
 def main() -> int:
     """Run the bench from the command line."""
-    parser = argparse.ArgumentParser(prog="sioms bench", description="Measure the promises of SIOMS on this machine.")
+    parser = argparse.ArgumentParser(prog="sioms bench", description="Measure the guarantees of SIOMS on this machine.")
     add_arguments(parser)
     return run(parser.parse_args())
 

@@ -75,9 +75,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the bench."""
     names = "\n".join(f"  {name:10} {text}" for name, (_, text) in BENCHES.items())
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    parser.description = f"Measure the promises of SIOMS on this machine.\n\nsub-benches:\n{names}"
+    parser.description = f"Measure the guarantees of SIOMS on this machine.\n\nsub-benches:\n{names}"
     parser.add_argument("names", nargs="*", metavar="NAME", help="sub-benches to run; all when none is named")
-    parser.add_argument("--quick", action="store_true", help="few trials: seconds instead of minutes")
+    parser.add_argument("--quick", action="store_true", help="fewer trials: seconds instead of minutes")
     parser.add_argument("--trials", type=int, metavar="N", help="trials of each kill, hang and stop")
     parser.add_argument("--soak", type=int, metavar="N", help="opens and closes of the sub-bench open")
     parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench fuzz")
@@ -93,7 +93,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--picture",
         metavar="FILE",
         default="",
-        help="draw what the sub-bench tactile finds (png, pdf or svg)",
+        help="draw the results of the sub-bench tactile (png, pdf or svg)",
     )
     parser.add_argument("--json", metavar="FILE", help="write all figures to a file")
     parser.add_argument("--append", metavar="FILE", help="append them to a file, as one line of JSON")

@@ -38,15 +38,17 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     parser = subparsers.add_parser(
         "epics",
-        help="show nodes to EPICS clients, and let them stop and move axes",
+        help="serve nodes to EPICS clients, which may stop and move axes",
         description="A bridge to EPICS PV Access: an ordinary client of the daemon that shows axes as motors, with "
         "read-back, set-point, limits, done-moving and alarm, and analog and binary channels. Whoever reaches the port "
         "may read, and stop axes by a put to STOP. With --move, clients on this machine may also move axes, each while "
         "it renews its lease by puts to LEASE.",
     )
-    parser.add_argument("--listen", metavar="HOST:PORT", default=PLACE, help=f"where; default {PLACE}, *:5075 for all")
-    parser.add_argument("--prefix", metavar="TEXT", default="", help="what the names of all variables begin with")
-    parser.add_argument("--rate", metavar="HZ", type=positive, default=10.0, help="how often to look; default 10 Hz")
+    parser.add_argument(
+        "--listen", metavar="HOST:PORT", default=PLACE, help=f"address; default {PLACE}, *:5075 for all interfaces"
+    )
+    parser.add_argument("--prefix", metavar="TEXT", default="", help="prefix of all variable names")
+    parser.add_argument("--rate", metavar="HZ", type=positive, default=10.0, help="polling rate; default 10 Hz")
     parser.add_argument("--move", action="store_true", help="let clients on this machine move axes, under a lease")
 
 

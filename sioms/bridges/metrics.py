@@ -46,7 +46,9 @@ def add_parser(subparsers: Any) -> None:
         "late ticks and deaths of drivers to Prometheus, at http://HOST:PORT/metrics. It only reads. Whoever reaches "
         "the port may read, so that anything but loopback wants a firewall.",
     )
-    parser.add_argument("--listen", metavar="HOST:PORT", default=PLACE, help=f"where; default {PLACE}, *:9578 for all")
+    parser.add_argument(
+        "--listen", metavar="HOST:PORT", default=PLACE, help=f"address; default {PLACE}, *:9578 for all interfaces"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

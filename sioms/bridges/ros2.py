@@ -45,11 +45,13 @@ def add_parser(subparsers: Any) -> None:
         "each axis node, WrenchStamped of each force/torque sensor, and DiagnosticArray of the devices. It only reads.",
     )
     parser.add_argument(
-        "--router", metavar="LOCATOR", default=ROUTER, help=f"of Zenoh; default {ROUTER}, that of rmw_zenohd"
+        "--router", metavar="LOCATOR", default=ROUTER, help=f"Zenoh router; default {ROUTER}, that of rmw_zenohd"
     )
-    parser.add_argument("--rate", metavar="HZ", type=positive, default=100.0, help="of messages; default 100 Hz")
+    parser.add_argument("--rate", metavar="HZ", type=positive, default=100.0, help="message rate; default 100 Hz")
     parser.add_argument("--domain", metavar="NUMBER", type=whole(), default=0, help="ROS_DOMAIN_ID; default 0")
-    parser.add_argument("--prefix", metavar="NAME", default="", help="of topics; default: the name of the workcell")
+    parser.add_argument(
+        "--prefix", metavar="NAME", default="", help="prefix of topics; default: the name of the workcell"
+    )
 
 
 def run(args: argparse.Namespace) -> int:

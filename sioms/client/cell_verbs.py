@@ -481,7 +481,7 @@ class WorkcellVerbs(Generic[M]):
 
         Args:
             node: a node or device, with all its parts; '' = all on which this user has the right.
-            note: what to tell others.
+            note: a note for others.
 
         Returns:
             Those that nobody had acknowledged before, as ``alarms``.

@@ -18,15 +18,15 @@ def add_parser(subparsers: Any) -> None:
     """Add ``cert`` to the subcommands of ``sioms``."""
     cert = subparsers.add_parser(
         "cert",
-        help="make an authority, and certificates for gateways and clients over Zenoh",
-        description="One machine has the authority. Every gateway and every client requests a certificate of it, whose "
-        "key never leaves their machine; each gateway lists whose certificates it lets in, by `sioms key allow`.",
+        help="create an authority, and certificates for gateways and clients over Zenoh",
+        description="One machine has the authority. Every gateway and every client requests a certificate from it; "
+        "secret keys never leave their machines. Each gateway lists the certificates it admits, by `sioms key allow`.",
     )
     verbs = cert.add_subparsers(dest="verb", required=True, metavar="VERB")
-    authority = verbs.add_parser("authority", help="make the authority of a fleet on this machine")
+    authority = verbs.add_parser("authority", help="create the authority of a fleet on this machine")
     authority.add_argument("name", nargs="?", default="fleet", help="default: fleet")
     authority.add_argument("--days", type=whole(1), default=3650, help="how long it holds; default 3650")
-    request = verbs.add_parser("request", help="make a key of one's own, and print a request for its certificate")
+    request = verbs.add_parser("request", help="create your own key, and print a certificate request")
     request.add_argument("name", nargs="?", default="", help="default: the user's name; of a gateway that of the cell")
     sign = verbs.add_parser("sign", help="sign a request, and print the certificate")
     sign.add_argument("file", help="what `sioms cert request` has printed; - for standard input")
@@ -34,14 +34,14 @@ def add_parser(subparsers: Any) -> None:
         "--host", action="append", default=[], help="a gateway's: name or address it is reached by; again for more"
     )
     sign.add_argument("--days", type=whole(1), default=365, help="how long it holds; default 365")
-    install = verbs.add_parser("install", help="take a signed certificate for one's own")
+    install = verbs.add_parser("install", help="install your own signed certificate")
     install.add_argument("file", help="what `sioms cert sign` has printed; - for standard input")
-    listing = verbs.add_parser(
-        "list", help="list one's own certificate, and those that this machine's authority has signed"
-    )
-    listing.add_argument("--json", action="store_true", help="as JSON")
+    listing = verbs.add_parser("list", help="list your own certificate, and those signed by this machine's authority")
+    listing.add_argument("--json", action="store_true", help="print JSON")
     for each in verbs.choices.values():
-        each.add_argument("--keys", metavar="FOLDER", default="", help="of keys; default $SIOMS_KEYS or the user's own")
+        each.add_argument(
+            "--keys", metavar="FOLDER", default="", help="folder of keys; default $SIOMS_KEYS or the user's own"
+        )
 
 
 def _read(path: str) -> bytes:

@@ -23,21 +23,23 @@ def add_parser(subparsers: Any) -> None:
     """Add ``serve`` and ``key`` to the subcommands of ``sioms``."""
     serve = subparsers.add_parser(
         "serve",
-        help="let clients on other machines use the workcell",
+        help="gateway for clients on other machines",
         description="A gateway: an ordinary client of the daemon that passes on what the holders of keys ask for, over "
         "ZeroMQ with CURVE, over Zenoh with certificates, or over both.",
     )
     serve.add_argument(
-        "--listen", metavar="HOST:PORT", help=f"where, over ZeroMQ, and at the port after it for stops; default "
+        "--listen", metavar="HOST:PORT", help=f"ZeroMQ address; stops use the next port; default "
         f"{PLACE} unless --zenoh is given, *:5770 for all"
     )  # fmt: skip
-    serve.add_argument("--zenoh", metavar="HOST:PORT", help="where, over Zenoh, *:5780 for all; needs `sioms cert`")
+    serve.add_argument(
+        "--zenoh", metavar="HOST:PORT", help="Zenoh address, *:5780 for all interfaces; needs `sioms cert`"
+    )
     serve.add_argument("--socket", metavar="PATH", default="", help="the daemon's socket")
-    key = subparsers.add_parser("key", help="make, allow, list and revoke the keys of remote clients")
+    key = subparsers.add_parser("key", help="create, allow, list and revoke keys of remote clients")
     verbs = key.add_subparsers(dest="verb", required=True, metavar="VERB")
-    new = verbs.add_parser("new", help="make a key of one's own")
+    new = verbs.add_parser("new", help="create your own key")
     new.add_argument("name", nargs="?", default="", help="default: the user's name")
-    allow = verbs.add_parser("allow", help="let the holder of a key in through the gateway of this user")
+    allow = verbs.add_parser("allow", help="admit the holder of a key at this user's gateway")
     allow.add_argument("name", help="what messages and grants call it")
     allow.add_argument(
         "public",
@@ -45,17 +47,17 @@ def add_parser(subparsers: Any) -> None:
         help="the public key, of `sioms key list` on the other machine, or a certificate: cert-NNNN",
     )
     allow.add_argument("--group", action="append", default=[], metavar="NAME", help="a group of grants; again for more")
-    trust = verbs.add_parser("trust", help="take a public key for that of a gateway")
+    trust = verbs.add_parser("trust", help="record the public key of a gateway as trusted")
     trust.add_argument("address", help="zmq://HOST:PORT")
     trust.add_argument("public", metavar="KEY", help="the public key, of `sioms key list` on that machine")
-    listing = verbs.add_parser(
-        "list", help="list one's own public key, who may come in, and which gateways are trusted"
-    )
-    listing.add_argument("--json", action="store_true", help="as JSON")
-    revoke = verbs.add_parser("revoke", help="let a key in no more, or forget a gateway; what it held halts")
+    listing = verbs.add_parser("list", help="list your own public key, the keys admitted, and the gateways trusted")
+    listing.add_argument("--json", action="store_true", help="print JSON")
+    revoke = verbs.add_parser("revoke", help="stop admitting a key, or trusting a gateway; what it held halts")
     revoke.add_argument("name", help="of a key, or HOST:PORT of a gateway")
     for each in (serve, *verbs.choices.values()):
-        each.add_argument("--keys", metavar="FOLDER", default="", help="of keys; default $SIOMS_KEYS or the user's own")
+        each.add_argument(
+            "--keys", metavar="FOLDER", default="", help="folder of keys; default $SIOMS_KEYS or the user's own"
+        )
 
 
 def run(args: argparse.Namespace) -> int:

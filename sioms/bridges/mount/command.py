@@ -29,7 +29,7 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     one = subparsers.add_parser(
         "mount",
-        help="show device nodes as files, for cat, echo, dd and every program",
+        help="mount device nodes as files, for cat, echo, dd and any program",
         description="Mount the nodes of the workcell as files in a folder, until interrupted. A file that is open for "
         "writing is held; closing it, or the end of its process however it ends, halts its axes. Refusals are errnos; "
         "their sentences are in DIR/.log. Writing to DIR/.stop is an emergency stop of the workcell.",
@@ -39,7 +39,7 @@ def add_parser(subparsers: Any) -> None:
         "--lease", type=positive, default=LEASE_S, metavar="SECONDS",
         help=f"halt axes when their process is stopped, or this one hangs, for SECONDS (default: {LEASE_S:g})",
     )  # fmt: skip
-    one.add_argument("--allow-other", action="store_true", help="let all users in, each with his own rights (as root)")
+    one.add_argument("--allow-other", action="store_true", help="admit all users, each with their own rights (as root)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -25,17 +25,17 @@ class Verb:
 
 VERBS: dict[str, Verb] = {
     "friction": Verb("friction", "drag rubber over indenters in a simulated rig and fit the coefficients of friction"),
-    "reproduce": Verb("reproduce", "repeat the source's experiments in a simulated plane: source, ours, and why"),
-    "demo": Verb("demo", "demonstrate grasp, regrasp, roll, hold, a knock and a dead finger on an unknown object"),
-    "grasp": Verb("skill", "close on whatever is between the fingers, and feel it"),
-    "sense": Verb("skill", "feel what is held: friction angles, contacts, curvatures"),
-    "classify": Verb("skill", "tell whether what is held answers like a disk or like a rectangle"),
-    "regrasp": Verb("skill", "open, go to the parallel grasp that is expected, and close again"),
-    "roll": Verb("skill", "roll what is held until the grasp is parallel"),
-    "hold": Verb("skill", "hold for a time, and keep the grasp parallel by rolling"),
+    "reproduce": Verb("reproduce", "repeat the published experiments in a simulated plane and explain differences"),
+    "demo": Verb("demo", "demonstrate grasp, regrasp, roll, hold, a push and a failed finger on an unknown object"),
+    "grasp": Verb("skill", "close on whatever is between the fingers and measure the contacts"),
+    "sense": Verb("skill", "measure what is held: friction angles, contacts, curvatures"),
+    "classify": Verb("skill", "tell whether the object behaves like a disk or like a rectangle"),
+    "regrasp": Verb("skill", "open, move to the predicted parallel grasp, and close again"),
+    "roll": Verb("skill", "roll the object until the grasp is parallel"),
+    "hold": Verb("skill", "hold for a time, keeping the grasp parallel by rolling"),
     "release": Verb("skill", "open the hand"),
     "slow": Verb("slow", "write the configuration of a simulated hand in slow motion, for a slow or busy machine"),
-    "trials": Verb("trials", "grasp random convex objects in a simulated plane and count what becomes of them"),
+    "trials": Verb("trials", "grasp random convex objects in a simulated plane and count the outcomes"),
 }
 
 

@@ -10,8 +10,8 @@ from sioms.arguments import positive
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("--speed", type=positive, default=5.0, metavar="MM/S", help="of the drag (default 5)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of the noise (default 1)")
+    parser.add_argument("--speed", type=positive, default=5.0, metavar="MM/S", help="drag speed (default 5)")
+    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the noise (default 1)")
 
 
 def run(args: argparse.Namespace) -> int:

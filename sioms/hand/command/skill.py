@@ -36,13 +36,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--node", default="hand", metavar="NAME", help="the hand's node (default hand)")
     parser.add_argument(
         "--fingers", nargs=2, default=["touch1.shape", "touch2.shape"], metavar="NODE",
-        help="what each finger feels (default touch1.shape touch2.shape)",
+        help="estimate of each finger (default touch1.shape touch2.shape)",
     )  # fmt: skip
     parser.add_argument(
         "--force", type=positive, default=1.0, metavar="N", help="internal force in newtons (default 1)"
     )
     parser.add_argument(
-        "--time", type=positive, default=HOLD_S, metavar="S", help=f"how long `hold` holds (default {HOLD_S:g} s)"
+        "--time", type=positive, default=HOLD_S, metavar="S", help=f"duration of `hold` (default {HOLD_S:g} s)"
     )
 
 

@@ -12,8 +12,10 @@ PACE = 0.25
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("config", type=Path, metavar="FILE", help="configuration of the cell, such as etc/hand.toml")
-    parser.add_argument("--pace", type=float, default=PACE, metavar="P", help=f"of its time (default {PACE:g})")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="where to; else to standard output")
+    parser.add_argument(
+        "--pace", type=float, default=PACE, metavar="P", help=f"simulated seconds per second (default {PACE:g})"
+    )
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="output file (default: standard output)")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -30,19 +30,21 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     for name, subject in SUBJECTS.items():
         of = kinds.add_parser(name, help=subject.text)
         group = subject.arguments(of)
-        of.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
-        of.add_argument("--seed", type=whole(), default=1, help="of permutations and bootstrap")
-        of.add_argument("--quiet", action="store_true", help="no progress")
+        of.add_argument(
+            "--out", type=Path, default=Path("report"), metavar="DIR", help="folder of the report (default: report)"
+        )
+        of.add_argument("--seed", type=whole(), default=1, help="seed of permutations and bootstrap")
+        of.add_argument("--quiet", action="store_true", help="do not show progress")
         group.add_argument("--yes", action="store_true", help="move without asking")
         group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
     draft = kinds.add_parser(
-        "describe", help="look at records, draft columns.toml and nominal.toml, and ask for the rest"
+        "describe", help="inspect records, draft columns.toml and nominal.toml, and list open questions"
     )
     draft.add_argument("data", type=Path, metavar="DATA", help="file or folder of recordings of a motor axis")
     draft.add_argument(
-        "--out", type=Path, default=None, metavar="DIR", help="write both drafts there; they are new files"
+        "--out", type=Path, default=None, metavar="DIR", help="write both drafts to DIR, never overwriting a file"
     )
-    score = kinds.add_parser("score", help="solve a folder of fingers whose truth is known")
+    score = kinds.add_parser("score", help="diagnose a folder of fingers with known answers")
     score.add_argument("data", type=Path, metavar="PUBLIC", help="one folder for each finger")
     score.add_argument("truth", type=Path, metavar="TRUTH", help="NAME.json for each finger")
     test = kinds.add_parser("selftest", help="blind test on generated axes or sensors with hidden effects")
@@ -51,27 +53,23 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         nargs="?",
         choices=("axis", "tactile", "force"),
         default="axis",
-        help="what is generated (default axis)",
+        help="subject to generate (default axis)",
     )
     test.add_argument("--axes", "--count", type=whole(1), default=20, help="number of axes or sensors")
-    test.add_argument("--seed", type=whole(), default=1, help="of the generator")
-    test.add_argument(
-        "--out", type=Path, default=None, metavar="DIR", help="keep what was generated and the answers here"
-    )
-    test.add_argument("--jobs", type=whole(), default=0, help="solvers at a time (default: one for each core)")
+    test.add_argument("--seed", type=whole(), default=1, help="seed of the generator")
+    test.add_argument("--out", type=Path, default=None, metavar="DIR", help="keep generated data and answers in DIR")
+    test.add_argument("--jobs", type=whole(), default=0, help="number of parallel processes (default: one per core)")
     test.add_argument(
         "--replicates",
         type=whole(),
         default=0,
-        help="solve each so many times more with its blocks drawn anew",
+        help="additional diagnoses of each with resampled blocks",
     )
-    test.add_argument(
-        "--damaged", action="store_true", help="damage what is generated instead, in a hundred ways: nothing is named"
-    )
+    test.add_argument("--damaged", action="store_true", help="damage the data in a hundred ways; nothing may be named")
     watch.add_parser(kinds)
     effects = kinds.add_parser("effects", help="print the library of effects")
-    effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="whose (default axis)")
-    effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures there instead")
+    effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="subject (default axis)")
+    effects.add_argument("--out", type=Path, default=None, metavar="DIR", help="write page and pictures to DIR instead")
     parser.set_defaults(run=run)
     return parser
 

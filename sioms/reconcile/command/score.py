@@ -1,4 +1,4 @@
-"""``sioms reconcile score``: solve a folder of fingers whose truth is known, and lay out who was judged right.
+"""``sioms reconcile score``: diagnose a folder of fingers with known answers, and tabulate the results.
 
 ``PUBLIC/NAME/`` holds one finger as ``sioms reconcile tactile`` reads it, ``TRUTH/NAME.json`` its hidden effects
 (``effects``, and ``parameters`` and ``elements`` to compare sizes with). The truth is read after the verdict.

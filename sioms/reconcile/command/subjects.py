@@ -55,7 +55,7 @@ def _axis_arguments(parser: argparse.ArgumentParser) -> Any:
         type=whole(),
         default=None,
         metavar="SEED",
-        help="draw the blocks of time anew: does the verdict stand?",
+        help="resample the blocks of time, to test whether the verdict is stable",
     )
     group = parser.add_argument_group("with a node")
     group.add_argument(
@@ -72,10 +72,13 @@ def _axis_arguments(parser: argparse.ArgumentParser) -> Any:
         "--first",
         choices=("full", "one_speed"),
         default="full",
-        help="what is run before anything is decided",
+        help="experiments to run first",
     )
     group.add_argument(
-        "--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload"
+        "--install",
+        type=Path,
+        metavar="FILE",
+        help="write the corrected model to FILE, for a simulated twin, and reload",
     )
     return group
 
@@ -129,12 +132,12 @@ def _tactile_arguments(parser: argparse.ArgumentParser) -> Any:
         "--model", type=Path, metavar="FILE", help="nominal finger (TOML; default: nominal.json in DATA)"
     )
     group = parser.add_argument_group("with a node")
-    group.add_argument("--place", default="prober.place", metavar="NODE", help="axis round the finger (prober.place)")
+    group.add_argument("--place", default="prober.place", metavar="NODE", help="axis around the finger (prober.place)")
     group.add_argument(
         "--press",
         default="prober.radial",
         metavar="NODE",
-        help="axis that presses, deeper with larger positions (prober.radial)",
+        help="axis that presses, deeper at larger positions (prober.radial)",
     )
     group.add_argument("--force", default="force0.fz", metavar="NODE", help="force on the finger (force0.fz)")
     group.add_argument(
@@ -150,22 +153,22 @@ def _tactile_arguments(parser: argparse.ArgumentParser) -> Any:
         nargs="+",
         default=[0.0],
         metavar="R",
-        help="radii at hand in m, 0 an edge, inf a flat; the first is mounted, the others are asked for (0)",
+        help="available radii in m, 0 an edge, inf a flat; the first is mounted, the others are requested (0)",
     )
     group.add_argument("--load", type=positive, default=200.0, metavar="N/M", help="usual load (200)")
     group.add_argument("--most-load", type=positive, default=250.0, metavar="N/M", help="largest load (250)")
-    group.add_argument("--step", type=positive, default=2.0, metavar="DEG", help="from place to place (2)")
+    group.add_argument("--step", type=positive, default=2.0, metavar="DEG", help="distance between touches (2)")
     group.add_argument(
         "--first",
         choices=("full", "one_place"),
         default="full",
-        help="what is recorded before anything is decided",
+        help="touches to record first",
     )
     group.add_argument(
         "--install",
         type=Path,
         metavar="FILE",
-        help="write the corrected finger there and have the driver load it",
+        help="write the corrected finger to FILE and make the driver load it",
     )
     return group
 
@@ -212,19 +215,20 @@ def _force_arguments(parser: argparse.ArgumentParser) -> Any:
         "--columns", type=Path, metavar="FILE", help="column description (default: columns.toml beside DATA)"
     )
     group = parser.add_argument_group("with a node")
-    group.add_argument("--stand", type=Path, metavar="FILE", help="how the sensor can be loaded (TOML)")
-    group.add_argument(
-        "--first", choices=("full", "one"), default="full", help="what is applied before anything is decided"
-    )
+    group.add_argument("--stand", type=Path, metavar="FILE", help="loads that can be applied to the sensor (TOML)")
+    group.add_argument("--first", choices=("full", "one"), default="full", help="loads to apply first")
     group.add_argument(
         "--rest",
         type=positive,
         default=120.0,
         metavar="S",
-        help="time without a load, where that decides (120)",
+        help="time without a load, if it is needed to decide (120)",
     )
     group.add_argument(
-        "--install", type=Path, metavar="FILE", help="write the model there, for a simulated twin, and reload"
+        "--install",
+        type=Path,
+        metavar="FILE",
+        help="write the corrected model to FILE, for a simulated twin, and reload",
     )
     return group
 

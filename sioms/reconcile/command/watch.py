@@ -23,29 +23,27 @@ def add_parser(kinds: Any) -> None:
     """Add the command."""
     one = kinds.add_parser(
         "watch",
-        help="watch axes in production and tell what drifts, by name, size and since when",
-        description="Learn what is normal of axes from the moves that they make anyway, and tell drifts as alarms: "
+        help="watch axes in production for drift: cause, size and onset",
+        description="Learn the normal behaviour of axes from their moves in production, and report drifts as alarms: "
         "friction, play, mass, force, place. Nothing is moved and nothing is changed.",
     )
-    one.add_argument("nodes", nargs="*", metavar="NODE", help="nodes of single axes (of a recording: default all)")
-    one.add_argument("--recording", type=Path, metavar="FILE", help="watch over a recording instead of a cell")
+    one.add_argument("nodes", nargs="*", metavar="NODE", help="nodes of single axes (with --recording: default all)")
+    one.add_argument("--recording", type=Path, metavar="FILE", help="analyse a recording instead of a running cell")
     one.add_argument("--model", action="append", default=[], metavar="NODE=FILE", help="model file of an axis")
     one.add_argument(
         "--reference", action="append", default=[], metavar="NODE=BIT",
-        help="node of one bit that changes at a fixed place of the axis's load, as a light beam",
+        help="node of one bit that changes at a fixed position of the axis's load, such as a light beam",
     )  # fmt: skip
-    one.add_argument("--learn", type=positive, default=2.0, metavar="H", help="commissioning lasts so long [h] (2)")
+    one.add_argument("--learn", type=positive, default=2.0, metavar="H", help="length of commissioning [h] (2)")
+    one.add_argument("--state", type=Path, default=Path("watch.json"), metavar="FILE", help="state file (watch.json)")
+    one.add_argument("--relearn", action="store_true", help="learn the named axes again from now on")
+    one.add_argument("--time", type=positive, metavar="S", help="stop after this time [s]")
     one.add_argument(
-        "--state", type=Path, default=Path("watch.json"), metavar="FILE", help="where it is kept (watch.json)"
+        "--out", type=Path, default=Path("report"), metavar="DIR", help="folder of the report (default: report)"
     )
-    one.add_argument("--relearn", action="store_true", help="take for normal what the named axes are from now on")
-    one.add_argument("--time", type=positive, metavar="S", help="end after so long [s]")
-    one.add_argument("--out", type=Path, default=Path("report"), metavar="DIR", help="where the report goes")
+    one.add_argument("--propose", action="store_true", help="write corrected twins and gains from the state, and exit")
     one.add_argument(
-        "--propose", action="store_true", help="from what is kept, write corrected twins and gains, and end"
-    )
-    one.add_argument(
-        "--install", type=Path, metavar="FILE", help="the same, and write the twin of the one NODE there, too"
+        "--install", type=Path, metavar="FILE", help="like --propose, and also write the twin of the one NODE to FILE"
     )
     one.add_argument("--socket", metavar="PATH", help="the daemon's socket")
 

@@ -1,4 +1,4 @@
-"""``sioms blackbox``: tell what went wrong; keep the last minute of everything."""
+"""``sioms blackbox``: explain what went wrong; keep the last minute of everything."""
 
 from __future__ import annotations
 
@@ -32,25 +32,21 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     one = subparsers.add_parser(
         "blackbox",
-        help="tell what went wrong; keep the last minute of everything",
-        description="Tell in sentences what happened in a black box or in any other recording, in which order, and "
+        help="explain what went wrong; keep the last minute of everything",
+        description="Explain what happened in a black box or any other recording, in which order, and "
         "what began it. With --keep: keep the last minute of everything in memory, and write it to a file at each "
         "stop, fault and death, and on request.",
     )
     one.add_argument("file", metavar="FILE", nargs="?", help="box or recording (default: the newest in the folder)")
     one.add_argument("--keep", action="store_true", help="keep the last minute, until interrupted")
-    one.add_argument("--write", action="store_true", help="have the keeper write a box now; print its name")
+    one.add_argument("--write", action="store_true", help="write a box now and print its name")
     one.add_argument(
         "-d", "--folder", metavar="FOLDER", help="folder of boxes (default: $SIOMS_BLACKBOX, or the user's)"
     )
-    one.add_argument("--memory", type=size, default=256_000_000, metavar="SIZE", help="memory at most (default: 256M)")
-    one.add_argument(
-        "--seconds", type=positive, default=KEPT_S, metavar="SECONDS", help="how much to keep (default: 60)"
-    )
-    one.add_argument("--json", action="store_true", help="tell it as JSON")
-    one.add_argument(
-        "-a", "--all", action="store_true", help="tell all that happened, not only what belongs to the trouble"
-    )
+    one.add_argument("--memory", type=size, default=256_000_000, metavar="SIZE", help="memory limit (default: 256M)")
+    one.add_argument("--seconds", type=positive, default=KEPT_S, metavar="SECONDS", help="time to keep (default: 60)")
+    one.add_argument("--json", action="store_true", help="print JSON")
+    one.add_argument("-a", "--all", action="store_true", help="print all events, not only those of the incident")
 
 
 def run(args: argparse.Namespace) -> int:

@@ -24,32 +24,32 @@ from sioms.recording.tables import head_of, main_column, of_events, of_table
 
 def add_parser(subparsers: Any) -> None:
     """Add the command with its actions."""
-    log = subparsers.add_parser("log", help="show, plot, export, cut and merge recordings")
+    log = subparsers.add_parser("log", help="inspect, plot, export, cut and merge recordings")
     actions = log.add_subparsers(dest="action", metavar="ACTION", required=True)
-    one = actions.add_parser("info", help="print what is in a recording, and what is lost")
+    one = actions.add_parser("info", help="print the contents of a recording, and what is missing")
     one.add_argument("file", metavar="FILE")
     one.add_argument("-e", "--events", action="store_true", help="print all that happened, in order")
-    one.add_argument("--json", action="store_true", help="as JSON")
+    one.add_argument("--json", action="store_true", help="print JSON")
     one = actions.add_parser("plot", help="plot nodes over time")
     one.add_argument("file", metavar="FILE")
     one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all)")
     one.add_argument("-c", "--column", default="", help="e.g. velocity (default: position of axes, data of others)")
     one.add_argument("-o", "--output", metavar="PICTURE", required=True, help="PNG, SVG or PDF to write")
     _add_span(one)
-    one = actions.add_parser("export", help="write a node, or what happened, as a table")
+    one = actions.add_parser("export", help="write a node, or the events, as a table")
     one.add_argument("file", metavar="FILE")
     one.add_argument("node", metavar="NODE", nargs="?", help="node (default: the only one that is recorded)")
-    one.add_argument("-e", "--events", action="store_true", help="write what happened instead of a node")
+    one.add_argument("-e", "--events", action="store_true", help="write events instead of a node")
     one.add_argument("-o", "--output", metavar="TABLE", required=True, help=f"file that ends in {', '.join(FORMATS)}")
-    one.add_argument("-c", "--column", action="append", help="e.g. position; several by several -c (default: all)")
+    one.add_argument("-c", "--column", action="append", help="e.g. position; may be repeated (default: all)")
     _add_span(one)
-    one = actions.add_parser("cut", help="write a part of a recording as a recording")
+    one = actions.add_parser("cut", help="write part of a recording to a new recording")
     one.add_argument("file", metavar="FILE")
     one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all); events are kept in any case")
     one.add_argument("-o", "--output", metavar="FILE", required=True, help="MCAP file to write")
     _add_span(one)
     one = actions.add_parser(
-        "merge", help="write several recordings as one; of one: pack it, leaving out what is damaged"
+        "merge", help="write several recordings into one; a single one is packed, without its damaged parts"
     )
     one.add_argument("files", metavar="FILE", nargs="+")
     one.add_argument("-o", "--output", metavar="FILE", required=True, help="MCAP file to write")
@@ -57,9 +57,9 @@ def add_parser(subparsers: Any) -> None:
 
 def _add_span(parser: Any) -> None:
     parser.add_argument(
-        "--from", dest="start", type=seconds, metavar="SECONDS", help="begin so long after its beginning"
+        "--from", dest="start", type=seconds, metavar="SECONDS", help="start, relative to its beginning"
     )
-    parser.add_argument("--to", dest="end", type=seconds, metavar="SECONDS", help="end so long after its beginning")
+    parser.add_argument("--to", dest="end", type=seconds, metavar="SECONDS", help="end, relative to its beginning")
 
 
 def run(args: argparse.Namespace) -> int:

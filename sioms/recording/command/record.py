@@ -35,18 +35,18 @@ def add_parser(subparsers: Any) -> None:
     """Add the command."""
     one = subparsers.add_parser(
         "record",
-        help="record everything that nodes publish and are told",
+        help="record readings, commands and events",
         description="Record every publication of every node, and commands, refusals, markers, stops, faults and log "
-        "lines, until interrupted. What has been recorded outlives a kill of the recorder.",
+        "lines, until interrupted. What has been recorded survives if the recorder is killed.",
     )
     one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes to record (default: all)")
     one.add_argument("-o", "--output", metavar="FILE", required=True, help="MCAP file to write")
-    one.add_argument("-t", "--time", type=positive, metavar="SECONDS", help="end after SECONDS")
+    one.add_argument("-t", "--time", type=positive, metavar="SECONDS", help="stop after SECONDS")
     rotation = "begin a new file after"
     one.add_argument("--rotate-size", type=size, default=0, metavar="SIZE", help=f"{rotation} SIZE, as 500M or 2G")
     one.add_argument("--rotate-time", type=positive, default=0.0, metavar="SECONDS", help=f"{rotation} SECONDS")
-    one.add_argument("--no-pack", action="store_true", help="leave files as written, not compressed, not indexed")
-    one.add_argument("-v", "--verbose", action="store_true", help="print once a second how much has been recorded")
+    one.add_argument("--no-pack", action="store_true", help="do not compress and index files at the end")
+    one.add_argument("-v", "--verbose", action="store_true", help="print the amount recorded once a second")
 
 
 def run(args: argparse.Namespace) -> int:

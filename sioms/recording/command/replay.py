@@ -22,14 +22,12 @@ def add_parser(subparsers: Any) -> None:
         "replay",
         help="serve a recording as read-only nodes",
         description="Serve the nodes of a recording, to be read by every tool, on a socket of its own; they begin to "
-        "change when the first of them is opened. With a command: run it on them, and end with it.",
+        "change when the first of them is opened. With a command: run it with this socket, and end when it ends.",
     )
     one.add_argument("file", metavar="FILE")
     one.add_argument("words", metavar="COMMAND", nargs="*", help="command to run, after --")
-    one.add_argument(
-        "-r", "--rate", type=positive, default=1.0, metavar="RATE", help="so many times faster (default: 1)"
-    )
-    one.add_argument("--loop", action="store_true", help="begin again at the end")
+    one.add_argument("-r", "--rate", type=positive, default=1.0, metavar="RATE", help="playback speed (default: 1)")
+    one.add_argument("--loop", action="store_true", help="start again at the end")
     one.add_argument("--socket", metavar="PATH", help="socket to serve (default: a new one, which is printed)")
 
 

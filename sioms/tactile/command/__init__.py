@@ -18,7 +18,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     parser = subparsers.add_parser("tactile", help="design, calibrate and measure elastic fingers")
     commands = parser.add_subparsers(dest="tactile_command", required=True, metavar="COMMAND")
 
-    design = commands.add_parser("design", help="predict what a finger will be able to tell")
+    design = commands.add_parser("design", help="predict the accuracy of a finger design")
     design.add_argument("--core-mm", type=float, default=9.6, help="core radius (default 9.6)")
     design.add_argument("--outer-mm", type=float, default=12.7, help="outer radius (default 12.7)")
     design.add_argument("--depth-mm", type=float, default=2.4, help="effective depth of the elements (default 2.4)")
@@ -29,7 +29,9 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     design.add_argument("--noise-percent", type=float, default=0.1, help="strain noise in per cent (default 0.1)")
     design.add_argument("-o", "--output", type=Path, default=Path("design.html"), help="report (default design.html)")
 
-    reproduce = commands.add_parser("reproduce", help="recompute the published figures and tables beside their values")
+    reproduce = commands.add_parser(
+        "reproduce", help="recompute the published figures and tables, beside the published values"
+    )
     reproduce.add_argument("-o", "--output", type=Path, default=Path("reproduce.html"), help="report")
     reproduce.add_argument("--quick", action="store_true", help="a tenth of the Monte Carlo frames")
 
@@ -37,15 +39,19 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     calibrate.add_argument("data", type=Path, help="folder with recordings (*.npz) and nominal.json or nominal.toml")
     calibrate.add_argument("-o", "--output", type=Path, default=Path("finger.toml"), help="calibrated finger")
     calibrate.add_argument("-r", "--report", type=Path, help="report (default: the output's name with .html)")
-    calibrate.add_argument("--contact", choices=("frictionless", "adhering", "hertz"), help="contact model, not chosen")
+    calibrate.add_argument(
+        "--contact",
+        choices=("frictionless", "adhering", "hertz"),
+        help="contact model, instead of choosing it from the data",
+    )
     calibrate.add_argument("--no-map", action="store_true", help="do not identify the E map directly")
     calibrate.add_argument("--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)")
 
-    calibrate.add_argument("--doubtful", action="store_true", help="write the finger even if it is not to be believed")
-
-    score = commands.add_parser(
-        "score", help="calibrate on part of the touches, fit the rest, tabulate what is reached"
+    calibrate.add_argument(
+        "--doubtful", action="store_true", help="write the finger even if the calibration is refused"
     )
+
+    score = commands.add_parser("score", help="calibrate with part of the touches, test on the rest, print a table")
     score.add_argument("data", type=Path, nargs="+", help="folders of recordings, or folders of such folders")
     score.add_argument("--truth", type=Path, help="folder with the truth of generated data, NAME.json")
     score.add_argument("--jobs", type=int, help="processes (default: one for each core)")
