@@ -26,12 +26,13 @@ from sioms.protocol import verbs
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.socketpath import cell_address
 
-from .client.cell_verbs import MarkerVerbs, WorkcellVerbs
+from .client.cell_verbs import WorkcellVerbs
 from .client.channel import KEEPALIVE, Answer, Call, Channel, connect_channel
 from .client.faces import Awaiting
 from .client.fleet_verbs import FleetMarkerVerbs, FleetVerbs
 from .client.node_core import S
 from .client.node_verbs import AnalogVerbs, AxisVerbs, BinaryVerbs, NodeVerbs, select_nodes
+from .client.session import MarkerVerbs
 from .client.snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 
 if TYPE_CHECKING:

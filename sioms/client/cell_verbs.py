@@ -1,6 +1,4 @@
-"""The verbs of the connection to a daemon, the one list of which both faces are made (``faces``): names, opens,
-markers, stops.
-"""
+"""The verbs of a session with a daemon, the one list of which both faces are made (``faces``): names, opens, stops."""
 
 from __future__ import annotations
 
@@ -17,22 +15,19 @@ from sioms.protocol.text import printable, shown
 from .arguments import number as as_number
 from .channel import Call, Channel
 from .local import RENEWED_NS, node_parts
-from .marks import Generic, verb
+from .marks import verb
+from .session import M, Session
 from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable, Mapping
-    from typing import Any, ClassVar, Self, TypeVar
+    from typing import Any, ClassVar
 
     from sioms.protocol.clock import Clock
 
     from .node_verbs import AxisVerbs, NodeVerbs
     from .typed_faces import Waiter
-
-    M = TypeVar("M", bound="MarkerVerbs")
-else:
-    M = None
 
 STARTING_S = 5.0
 """How long a client waits for a daemon that says that it is starting [s]."""
@@ -75,51 +70,6 @@ def is_part(entry: NodeEntry, entries: Iterable[NodeEntry]) -> bool:
     )  # fmt: skip
 
 
-class MarkerVerbs(int):
-    """A reserved marker: the integer of its token."""
-
-    _cell: WorkcellVerbs[Any]
-
-    def __new__(cls, cell: WorkcellVerbs[Any], token: int) -> Self:
-        """Make a marker of its token."""
-        marker = int.__new__(cls, token)
-        marker._cell = cell
-        return marker
-
-    @property
-    def token(self) -> int:
-        """Number and key in one integer, below 2**50; needed to signal and to free."""
-        return int(self)
-
-    @property
-    def number(self) -> int:
-        """Its number, which is enough to wait."""
-        return int(self) & 1023
-
-    @verb
-    async def signal(self) -> None:
-        """Signal it; once is enough, more has no effect."""
-        await WorkcellVerbs.signal_marker(self._cell, self)
-
-    @verb
-    async def wait(self, timeout: float | None = None) -> int:
-        """Wait until it is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        return await WorkcellVerbs.wait_marker(self._cell, self, timeout)
-
-    @verb
-    async def free(self) -> None:
-        """Free it; who waits for it gets EPIPE."""
-        await WorkcellVerbs.free_marker(self._cell, self)
-
-    def __repr__(self) -> str:
-        return f"<{type(self).__name__} {self.number}>"
-
-    __str__ = __repr__
-
-    def __format__(self, spec: str) -> str:
-        return format(str(self), spec)
-
-
 def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call:
     """Make the request that opens a node."""
     access = _ACCESS.get(mode) if isinstance(mode, str) else None
@@ -143,7 +93,7 @@ def request_stop(request: StopRequest | None, why: str) -> Callable[[], bool] | 
     return lambda: request.taken(word)
 
 
-class WorkcellVerbs(Generic[M]):
+class WorkcellVerbs(Session[M]):
     """The verbs of a session with a daemon.
 
     Attributes:
@@ -152,21 +102,17 @@ class WorkcellVerbs(Generic[M]):
 
     _NODE: ClassVar[type[NodeVerbs[Any]]]
     _NODES: ClassVar[Mapping[NodeClass, type[NodeVerbs[Any]]]]
-    _MARKER: ClassVar[type[MarkerVerbs]]
+    _nodes: dict[int, NodeVerbs[Any]]
 
     def _waiter_of(self, channel: Channel) -> Waiter:
         """Return what waits for the answers on the channel of a node."""
         raise NotImplementedError
 
     def __init__(self, channel: Channel, waiter: Waiter, path: str) -> None:
-        self._channel = channel
-        self._waiter = waiter
+        super().__init__(channel, waiter)
         self._path = path
         self.name, self.rights = "", 0
         self._request: StopRequest | None = None
-        self._nodes: dict[int, NodeVerbs[Any]] = {}
-        self._drivers: dict[int, int] = {}
-        """Processes that halt what a node owns before its close is answered, as far as they are known."""
         self._fellows: list[Channel] = []
         self._beat_s = 0.0
 
@@ -186,9 +132,6 @@ class WorkcellVerbs(Generic[M]):
                 self._request = StopRequest(*answer.fds) if answer.fds else None
                 return
             await self._waiter.pause(0.02)
-
-    async def _ask(self, what: str, message: verbs.Message, limit_s: float | None = 0.0) -> Any:
-        return (await self._waiter.call(Call(what, message, limit_s=limit_s))).value
 
     def __repr__(self) -> str:
         if self._channel.closed:
@@ -264,18 +207,6 @@ class WorkcellVerbs(Generic[M]):
         for each in self._nodes.values():
             each._page.every_ns = min(int(self._beat_s * 1e9) or RENEWED_NS, RENEWED_NS)  # type: ignore[attr-defined]
 
-    async def _closed_handle(self, handle: int) -> None:
-        """Tell the daemon that a node was closed, and wait until its channels are free (nodes call this)."""
-        self._nodes.pop(handle, None)
-        driver = self._drivers.pop(handle, 0)
-        try:
-            await self._waiter.call(Call("close", verbs.Close(handle), through=driver))
-        except OSError as error:
-            # The session has ended, the daemon has gone, or knows no such handle any more: the driver has halted the
-            # axes at the end of file of the node's own socket either way.
-            if error.errno not in (errno.EIO, errno.EBADF) and not self._channel.ended:
-                raise
-
     @verb
     async def nodes(self) -> list[NodeEntry]:
         """Return all nodes that this user may read."""
@@ -304,10 +235,6 @@ class WorkcellVerbs(Generic[M]):
         clock = Clock()
         clock.wall = wall()
         return clock
-
-    def _here(self, there_ns: int) -> int:
-        """Return an instant of the cell's clock in that of this machine."""
-        return there_ns if self._channel.clock is None else self._channel.clock.here(there_ns)
 
     @verb
     async def status(self) -> dict[str, Any]:
@@ -371,40 +298,6 @@ class WorkcellVerbs(Generic[M]):
                 await node._ask(Request.STOP)
             raise
         return start_ns
-
-    # --- markers ---------------------------------------------------------------------------------
-
-    @verb
-    async def reserve_marker(self) -> M:
-        """Reserve a marker; it is freed with the session."""
-        return (await WorkcellVerbs.reserve_markers(self, 1))[0]
-
-    @verb
-    async def reserve_markers(self, count: int, *, persist: bool = False) -> list[M]:
-        """Reserve markers, all or none.
-
-        Args:
-            count: how many.
-            persist: keep them beyond the end of the session.
-        """
-        tokens = await self._ask(f"reserve {count} markers", verbs.ReserveMarker(count, persist))
-        marker: Any = self._MARKER
-        return [marker(self, token) for token in tokens]
-
-    @verb
-    async def free_marker(self, token: int) -> None:
-        """Free a marker; needs its token."""
-        await self._ask("free marker", verbs.FreeMarker(token))
-
-    @verb
-    async def signal_marker(self, token: int) -> None:
-        """Signal a marker; needs its token."""
-        await self._ask("signal marker", verbs.SignalMarker(token))
-
-    @verb
-    async def wait_marker(self, number: int, timeout: float | None = None) -> int:
-        """Wait until a marker is signalled; return when that was [ns, CLOCK_MONOTONIC]."""
-        return self._here(int(await self._ask("wait for marker", verbs.WaitMarker(number, timeout), limit_s=timeout)))
 
     # --- stops -----------------------------------------------------------------------------------
 

@@ -12,10 +12,11 @@ from sioms.protocol.flags import Request
 from sioms.protocol.text import printable
 
 from .arguments import number as as_number
-from .cell_verbs import MarkerVerbs, NodeEntry, WorkcellVerbs, request_stop
+from .cell_verbs import NodeEntry, WorkcellVerbs, request_stop
 from .channel import Answer, Call
 from .marks import verb
 from .node_verbs import NodeVerbs
+from .session import MarkerVerbs
 from .wall import wall
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from sioms.protocol.page import NotReadable
 from sioms.protocol.verbs import Subscribe
 
 from .arguments import integer, numbers, seconds
-from .cell_verbs import WorkcellVerbs
 from .channel import Call
 from .command import command
 from .marks import stream, verb
 from .node_core import Edges, Event, NodeCore, S
+from .session import Session
 from .snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 
 TYPE_CHECKING = False
@@ -42,7 +42,7 @@ def deadline_of(what: str, timeout: float | None) -> float | None:
 class NodeVerbs(NodeCore[S]):
     """The verbs of every node."""
 
-    def __init__(self, core: tuple[Any, ...], cell: WorkcellVerbs[Any], waiter: Waiter, lease: float = 0.0) -> None:
+    def __init__(self, core: tuple[Any, ...], cell: Session[Any], waiter: Waiter, lease: float = 0.0) -> None:
         super().__init__(*core)
         self._cell = cell
         self._waiter = waiter
@@ -87,13 +87,13 @@ class NodeVerbs(NodeCore[S]):
             case Request.GET_IO_STRUCT_INFO:
                 return self.info
             case Request.RESERVE_MARKER:
-                return int(await WorkcellVerbs.reserve_marker(self._cell))
+                return int(await Session.reserve_marker(self._cell))
             case Request.FREE_MARKER:
-                return await WorkcellVerbs.free_marker(self._cell, argument)  # type: ignore[arg-type]
+                return await Session.free_marker(self._cell, argument)  # type: ignore[arg-type]
             case Request.SIGNAL_MARKER:
-                return await WorkcellVerbs.signal_marker(self._cell, argument)  # type: ignore[arg-type]
+                return await Session.signal_marker(self._cell, argument)  # type: ignore[arg-type]
             case Request.WAIT_MARKER:
-                return await WorkcellVerbs.wait_marker(self._cell, argument, timeout)  # type: ignore[arg-type]
+                return await Session.wait_marker(self._cell, argument, timeout)  # type: ignore[arg-type]
             case Request.WAIT_UNTIL_EVENT if isinstance(self, BinaryVerbs):
                 mask: Any = -1 if argument is None else argument
                 return await BinaryVerbs.wait_event(self, mask, timeout=timeout)

@@ -7,10 +7,11 @@ import sys
 
 from sioms.protocol.socketpath import cell_address
 
-from .cell_verbs import MarkerVerbs, NodeEntry, WorkcellVerbs, is_part
+from .cell_verbs import NodeEntry, WorkcellVerbs, is_part
 from .channel import CONNECT_S, ENOUGH_LOOK_S, Channel, connect_channel
 from .faces import Blocking, BlockingWaiter, run
 from .node import NODE, Node
+from .session import MarkerVerbs
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:

@@ -13,7 +13,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Protocol
 
 from sioms.client.keys import Folder
 from sioms.client.wall import wall
@@ -24,6 +23,7 @@ from sioms.protocol.text import printable
 from .core import Gateway
 from .parts import Journal, Line, Node, Principal, Session
 from .sockets import DaemonLine, FollowedJournal, OpenNode
+from .transport import Transport
 
 KEYS_S = 0.1
 """How often the list of keys, and what piles up, are looked at [s]."""
@@ -35,38 +35,6 @@ def log(level: str, event: str, **words: object) -> None:
     """Write a line to standard error."""
     text = " ".join(f"{key}={printable(str(word), 300)!r}" for key, word in words.items())
     print(f"level={level} event={event.replace(' ', '-')} {text}".rstrip(), file=sys.stderr, flush=True)
-
-
-class Transport(Protocol):
-    """What brings frames of clients whose keys it has verified, and takes frames for them.
-
-    Attributes:
-        about: where it listens, for the log.
-        pending: whether frames wait of which no descriptor tells.
-    """
-
-    about: dict[str, str]
-
-    @property
-    def pending(self) -> bool: ...
-
-    def start(self) -> None:
-        """Begin."""
-
-    def owns(self, peer: bytes) -> bool:
-        """Tell whether a peer is one of this transport."""
-
-    def send(self, peer: bytes, frame: bytes) -> bool:
-        """Send a frame to a client; False when it has gone, or takes no more."""
-
-    def take(self) -> bool:
-        """Take frames of clients; return whether there are more."""
-
-    def look(self) -> None:
-        """Do what is due ten times a second."""
-
-    def close(self) -> None:
-        """Let go of everything."""
 
 
 class Keys:

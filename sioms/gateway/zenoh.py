@@ -34,7 +34,7 @@ from sioms.protocol.messages import MalformedMessage
 from .ways import Ways
 
 if TYPE_CHECKING:
-    from .serve import Serve
+    from .transport import Loop
 
 TURN = 200
 """Frames of clients that are taken before others have their turn."""
@@ -88,10 +88,10 @@ def _free(host: str, port: int) -> None:
 
 
 class Zenoh:
-    """See ``serve.Transport``.
+    """See ``transport.Transport``.
 
     Args:
-        serve: the loop.
+        loop: the loop it lives in.
         path: the daemon's socket.
         host, port: where to listen.
         folder: with the gateway's certificate.
@@ -100,8 +100,8 @@ class Zenoh:
         OSError: no certificate, or one that does not serve; the port is taken, or no such address is ours.
     """
 
-    def __init__(self, serve: Serve, path: str, host: str, port: int, folder: Folder) -> None:
-        self._serve, self._gateway = serve, serve.gateway
+    def __init__(self, loop: Loop, path: str, host: str, port: int, folder: Folder) -> None:
+        self._loop, self._gateway = loop, loop.gateway
         what = f"listen on {host}:{port}"
         mine = own(folder, what)
         if not mine.hosts:
@@ -117,7 +117,7 @@ class Zenoh:
         self._counting = threading.Lock()
         self._publishers: dict[bytes, zenoh.Publisher] = {}
         self._came = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
-        serve.add(self._came, self._heard)
+        loop.add(self._came, self._heard)
         self._stops: queue.SimpleQueue[tuple[str, str, bytes] | None] = queue.SimpleQueue()
         self._ways = Ways(path)
         self._thread = threading.Thread(target=self._run_stops, name="stops over Zenoh", daemon=True)
@@ -194,7 +194,7 @@ class Zenoh:
             with self._counting:
                 self._waiting[number] -= 1
             peer = f"{number}/{name}".encode()
-            who = self._serve.principal(number)
+            who = self._loop.principal(number)
             if frame is None:
                 self._gateway.gone(peer)
             elif who is None and peer not in self._gateway.sessions:
@@ -245,7 +245,7 @@ class Zenoh:
     def _run_stops(self) -> None:
         for number, name, frame in self._asked():
             try:
-                who = self._serve.principal(number)
+                who = self._loop.principal(number)
                 answer = self._ways.answer(who, self._host(number), frame) if who else None
                 if answer:
                     self._session.put(
@@ -256,7 +256,7 @@ class Zenoh:
                 continue
             except Exception as error:  # a mistake of ours costs this stop, not the next one
                 trace = "".join(traceback.format_exception(error)[-3:])
-                self._serve.log("error", "internal error", trace=trace)
+                self._loop.log("error", "internal error", trace=trace)
         self._ways.close()
 
     def close(self) -> None:
@@ -264,5 +264,5 @@ class Zenoh:
         self._stops.put(None)
         self._thread.join(2.0)
         self._session.close()  # type: ignore[no-untyped-call]
-        self._serve.remove(self._came)
+        self._loop.remove(self._came)
         os.close(self._came)

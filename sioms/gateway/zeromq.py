@@ -18,7 +18,7 @@ from .inflow import MOST, Inflow
 from .stops import DOMAIN, Stops
 
 if TYPE_CHECKING:
-    from .serve import Serve
+    from .transport import Loop
 
 TURN = 200
 """Frames of clients that are taken before others have their turn."""
@@ -44,10 +44,10 @@ def secured(context: zmq.Context[zmq.Socket[bytes]], kind: int, pair: Pair) -> z
 
 
 class ZeroMq:
-    """See ``serve.Transport``.
+    """See ``transport.Transport``.
 
     Args:
-        serve: the loop.
+        loop: the loop it lives in.
         path: the daemon's socket.
         host, port: where to listen; stops come in at the port after it.
         folder: of keys.
@@ -56,8 +56,8 @@ class ZeroMq:
         OSError: the port is taken, or no such address is ours.
     """
 
-    def __init__(self, serve: Serve, path: str, host: str, port: int, folder: Folder) -> None:
-        self._serve, self._gateway = serve, serve.gateway
+    def __init__(self, loop: Loop, path: str, host: str, port: int, folder: Folder) -> None:
+        self._loop, self._gateway = loop, loop.gateway
         self._known: dict[bytes, tuple[str, str, int]] = {}
         self._inflow = Inflow()
         pair = folder.own() or folder.new("gateway")
@@ -65,11 +65,11 @@ class ZeroMq:
         self._context = zmq.Context(1)
         self._router = secured(self._context, zmq.ROUTER, pair)
         stops = secured(self._context, zmq.ROUTER, pair)
-        self._stops = Stops(self._context, stops, path, serve.principal, self._inflow, serve.log)
+        self._stops = Stops(self._context, stops, path, loop.principal, self._inflow, loop.log)
         bind(self._router, host, port)
         bind(stops, host, port + 1)
         self._router_fd = int(self._router.getsockopt(zmq.FD))
-        serve.add(self._router_fd, lambda: None)
+        loop.add(self._router_fd, lambda: None)
 
     def start(self) -> None:
         """Begin to take stops."""
@@ -114,7 +114,7 @@ class ZeroMq:
             # A peer that names itself could take over the name of one that has gone: those of ZeroMQ begin with zero.
             if more or not self.owns(peer):
                 continue
-            gateway.frame(peer, self._serve.principal(public), host, frame)
+            gateway.frame(peer, self._loop.principal(public), host, frame)
             if peer not in gateway.sessions:
                 known.pop(peer, None)
         return True
@@ -122,12 +122,12 @@ class ZeroMq:
     def look(self) -> None:
         """End connections of which too much waits."""
         for fd in self._inflow.look():
-            self._serve.log("warning", "connection ended", why=f"more than {MOST} bytes of it wait", descriptor=fd)
+            self._loop.log("warning", "connection ended", why=f"more than {MOST} bytes of it wait", descriptor=fd)
 
     def close(self) -> None:
         """Let go of everything."""
         self._stops.close()
-        self._serve.remove(self._router_fd)
+        self._loop.remove(self._router_fd)
         self._router.close()
         self._context.term()
 

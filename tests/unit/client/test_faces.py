@@ -12,9 +12,10 @@ import pytest
 import sioms
 from sioms import aio
 from sioms.client import coordinates, node_verbs
-from sioms.client.cell_verbs import MarkerVerbs, WorkcellVerbs
+from sioms.client.cell_verbs import WorkcellVerbs
 from sioms.client.faces import Awaiting, Blocking
 from sioms.client.fleet_verbs import FleetMarkerVerbs, FleetVerbs
+from sioms.client.session import MarkerVerbs
 
 PAIRS = {
     sioms.Workcell: aio.AsyncWorkcell,
