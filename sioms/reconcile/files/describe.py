@@ -6,7 +6,6 @@ the others. What is not certain stands as a question in the draft, which then ca
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,18 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from sioms.reconcile.errors import BadInputError
+from sioms.reconcile.files.heads import WORDS, meaning
 from sioms.reconcile.files.table import SUFFIXES, UNITS, Array, Table, load_table, measures, named
 
-#: Words in the head of a column that tell what it probably is.
-WORDS = {
-    "time": ("t", "time", "zeit", "stamp", "timestamp", "temps", "tiempo"),
-    "command": ("cmd", "command", "ref", "reference", "set", "setpoint", "target", "soll", "qg", "desired", "demand"),
-    "velocity": ("vel", "velocity", "speed", "v", "rpm", "omega", "dq", "qd"),
-    "position": ("pos", "position", "enc", "encoder", "angle", "actual", "ist", "q", "qm", "counts", "x", "y"),
-    "force_measured": ("current", "cur", "i", "iq", "measured", "strom"),
-    "force": ("force", "torque", "u", "effort", "out", "output", "tau", "moment", "voltage", "vir"),
-    "index": ("index", "z", "mark"),
-}
 #: Two columns say the same from this correlation on; one changes evenly where its steps vary by less than this share.
 SAME, EVEN = 0.98, 0.1
 #: A column of time steps of the log may vary by so much of one: polled, not sampled.
@@ -35,6 +25,13 @@ FEWEST = 8
 #: An index mark passes in at most this share of the rows.
 RARE = 0.1
 NEEDED = ("position", "force")
+#: What is not needed, in words.
+SPARE = {"velocity": "a speed", "acceleration": "an acceleration"}
+#: What may stand for a quantity that is needed.
+HINTS = {
+    "position": "",
+    "force": "; what the drive was told, or where that was not recorded its measured force or current with a scale",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,14 +39,16 @@ class Guess:
     """What a column seems to be.
 
     Attributes:
-        quantity: of ``columns.toml``, or "velocity", which is not needed; None where nothing tells.
+        quantity: of ``columns.toml``, or one of `SPARE`, which is not needed; None where nothing tells.
         why: in words.
+        beside: another column that was taken for what the head of this one says.
     """
 
     head: str
     unit: str | None
     quantity: str | None
     why: str
+    beside: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,10 @@ def guessed(table: Table) -> list[Guess]:
                 out[head] = Guess(head, unit, quantity, "by its head")
                 taken[quantity] = head
     for head, values in table.columns.items():
-        if head not in out:
+        says = _by_head(head, table)
+        if head not in out and says in taken:
+            out[head] = Guess(head, table.units.get(head, named(head)[1]), _again(says), "by its head", taken[says])
+        elif head not in out:
             seems, why = _by_numbers(values, table, taken)
             out[head] = Guess(head, table.units.get(head, named(head)[1]), seems, why)
             if seems is not None:
@@ -104,12 +106,16 @@ def guessed(table: Table) -> list[Guess]:
     return [out[head] for head in table.columns]
 
 
+def _again(quantity: str) -> str | None:
+    """Return what a further column of a quantity is: another speed is as little needed as the first."""
+    return quantity if quantity in SPARE else None
+
+
 def _by_head(head: str, table: Table) -> str | None:
     """Return what the head says, where its unit and its numbers do not say otherwise."""
     name, unit = named(head)
     unit = table.units.get(head, unit)
-    words = [w for w in re.split(r"[\W_]+|(?<=[a-z])(?=[A-Z])", name) if w]
-    found = next((q for w in words for q, known in WORDS.items() if w.lower() in known), None)
+    found = meaning(name)
     kind = measures(unit) if unit is not None else None
     if kind == "speed":
         return "velocity"
@@ -119,6 +125,8 @@ def _by_head(head: str, table: Table) -> str | None:
         return "force" if found is None else None
     if kind == "time" and found != "time":
         return None
+    if found == "index" and not _fits(found, table.columns[head]):
+        found = "position"  # a place along z
     return found if found is not None and _fits(found, table.columns[head]) else None
 
 
@@ -184,9 +192,15 @@ def _step(table: Table, guesses: list[Guess]) -> tuple[float | None, list[str]]:
 
 def _questions(guesses: list[Guess]) -> list[str]:
     got = {g.quantity for g in guesses}
-    out = [f"which column is the {q}? It is needed." for q in NEEDED if q not in got]
+    out = [f"which column is the {q}? It is needed{HINTS[q]}." for q in NEEDED if q not in got]
+    for taken in (g for g in guesses if g.quantity is not None and g.quantity not in SPARE):
+        others = ", ".join(repr(g.head) for g in guesses if g.beside == taken.head)
+        if others:
+            out.append(f"which column is the {taken.quantity}, {taken.head!r} or {others}? The first is taken.")
     out += [
-        f"what is {g.head!r}? {g.why[0].upper()}{g.why[1:]}; it is left out." for g in guesses if g.quantity is None
+        f"what is {g.head!r}? {g.why[0].upper()}{g.why[1:]}; it is left out."
+        for g in guesses
+        if g.quantity is None and g.beside is None
     ]
     for g in guesses:
         if g.unit is None and g.quantity in ("position", "command", "force", "force_measured"):
@@ -202,9 +216,10 @@ def _columns(guesses: list[Guess], step: float | None) -> str:
     for g in guesses:
         head = g.head.replace("\\", "\\\\").replace('"', '\\"')
         if g.quantity is None:
-            lines.append(f'# QUANTITY = {{ name = "{head}" }}   # left out: {g.why}')
-        elif g.quantity == "velocity":
-            lines.append(f'# not needed: "{head}", a speed ({g.why})')
+            why = g.why if g.beside is None else f"{g.beside} was taken for what its head says"
+            lines.append(f'# QUANTITY = {{ name = "{head}" }}   # left out: {why}')
+        elif g.quantity in SPARE:
+            lines.append(f'# not needed: "{head}", {SPARE[g.quantity]} ({g.why})')
         else:
             unit = f', unit = "{g.unit}"' if g.unit else ', unit = "?"' if g.quantity not in ("time", "index") else ""
             scale = ", scale = 1.0" if g.unit and measures(g.unit) == "electric" and g.unit != "%" else ""

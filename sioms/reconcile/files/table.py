@@ -1,7 +1,9 @@
 """Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT, and recordings of one node.
 
 A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its
-head, a unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head. A
+head, a unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head.
+Without a head its columns are ``column 1``, ``column 2`` and so on. A matrix as MATLAB prints it (``[0 1.5; 1 2.5];``,
+a row a line) may stand for the rows. A
 time of day, with or without a date before it (``2024-02-01 12:30:00.125``), is read as seconds since midnight.
 """
 
@@ -113,6 +115,8 @@ REMARKS = 60
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
 _AFTER_SLASH = re.compile(r"^(.*?)\s*/\s*([^/]+)$")
 _CLOCK = re.compile(r"^(?:\S+[ T])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)Z?$")
+_MATRIX = re.compile(r"^\s*(?:\w+\s*=\s*)?\[\s*(?:[-+.\d]|$)")
+_BLANKS = re.compile(r"\s{2,}|\t")
 _AFTER_BAR = re.compile(r"^(.+)_([^_\W]+)$")
 
 
@@ -212,7 +216,7 @@ def _text(path: Path) -> Table:
         lines = raw.decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         lines = raw.decode("latin-1").splitlines()
-    lines = [line for line in lines if line.strip(" \t,;")]
+    lines = [line for line in _unbracketed(lines) if line.strip(" \t,;")]
     first = next(
         (
             i
@@ -225,8 +229,6 @@ def _text(path: Path) -> Table:
         raise BadInputError(
             f"read {path}: no numbers in the first {REMARKS} lines; needs one head line of names and numbers below"
         )
-    if first == 0:
-        raise BadInputError(f"read {path}: the first line has numbers, no names; needs one head line of names")
     rows = _numbers(lines[first:])
     if rows is None:
         bad = next(
@@ -237,7 +239,7 @@ def _text(path: Path) -> Table:
         raise BadInputError(
             f"read {path}: line {bad + 1} is no row of numbers like line {first + 1}: {lines[bad][:60]!r}"
         )
-    head, units = _head(lines[:first], rows.shape[1])
+    head, units = _head(lines[:first], rows.shape[1]) if first else (_numbered(rows.shape[1]), [])
     if any(_numbers([cell]) is not None for cell in head):
         raise BadInputError(
             f"read {path}: line {first} is neither names nor {rows.shape[1]} numbers: {lines[first - 1][:60]!r}"
@@ -246,6 +248,20 @@ def _text(path: Path) -> Table:
         raise BadInputError(f"read {path}: no line of {rows.shape[1]} names over {rows.shape[1]} columns")
     table = _table({n: np.ascontiguousarray(rows[:, i]) for i, n in enumerate(head)})
     return Table(table.columns, {**table.units, **{n: u for n, u in zip(head, units, strict=False) if u}})
+
+
+def _unbracketed(lines: Sequence[str]) -> Sequence[str]:
+    """Take the brackets and semicolons off a matrix that begins in one of the first lines, as MATLAB prints it."""
+    begin = next((i for i, line in enumerate(lines[:REMARKS]) if _MATRIX.match(line)), None)
+    if begin is None:
+        return lines
+    first = lines[begin].partition("[")[2]
+    return [*lines[:begin], *(line.strip().strip("[]; ") for line in (first, *lines[begin + 1 :]))]
+
+
+def _numbered(count: int) -> list[str]:
+    """Return the names of columns that have none."""
+    return [f"column {i}" for i in range(1, count + 1)]
 
 
 def _cells(line: str, sign: str | None) -> list[str]:
@@ -281,9 +297,18 @@ def _value(cell: str) -> float:
         return 3600.0 * int(m[1]) + 60.0 * int(m[2]) + float(m[3])
 
 
+def _names(line: str, count: int) -> list[str]:
+    """Part a line into so many names, with blanks in them where two blanks part the columns; none where it is not."""
+    sign = _sign(line)
+    cells = _cells(line, sign)
+    if len(cells) != count and sign in (None, "\t"):
+        cells = [c.strip() for c in _BLANKS.split(line.strip())]
+    return cells if len(cells) == count else []
+
+
 def _head(above: Sequence[str], count: int) -> tuple[list[str], list[str | None]]:
     """Find the names, and a line of units below them, in the lines above the numbers."""
-    wide = [c for line in above if len(c := _cells(line.lstrip("#%"), _sign(line))) == count]
+    wide = [c for line in above if (c := _names(line.lstrip("#%"), count))]
     if not wide:
         return [], []
     units = [unit_of(re.sub(r"[\[\]()]", "", c)) for c in wide[-1]]

@@ -11,7 +11,7 @@ import pytest
 from sioms.reconcile.command import main
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_data, read_model
-from sioms.reconcile.files.describe import describe, guessed
+from sioms.reconcile.files.describe import _by_head, describe, guessed
 from sioms.reconcile.files.table import Table, load_table, measures, unit_of
 from sioms.reconcile.model import AxisModel
 
@@ -38,6 +38,31 @@ def test_heads_tell_what_numbers_do_not_contradict() -> None:
         "Torque": "force",
     }
     assert quantities({"t": T[::-1], "x": X})["t"] is None  # time does not run backwards
+
+
+@pytest.mark.parametrize(("head", "quantity"), [
+    ("Encoder 1 Pos", "position"), ("Commanded Pos", "command"), ("joint_pos_target_0", "command"),
+    ("theta1", "position"), ("phi", "position"), ("z", "position"), ("dq7", "velocity"), ("ddq7", "acceleration"),
+    ("omega_max", "velocity"), ("target velocity", "velocity"), ("torque_ref", "force"), ("iq set", "force"),
+    ("measured torque", "force_measured"), ("current", "force_measured"), ("current position", "position"),
+    ("F", "force"), ("f", None), ("tau_est", "force"), ("q7_tau_J", "force"), ("Control Effort", "force"),
+    ("a", "acceleration"), ("x y", None), ("PWM", "force"), ("Stribeck", None),
+])  # fmt: skip
+def test_words_of_a_head_are_weighed_together(head: str, quantity: str | None) -> None:
+    assert _by_head(head, Table({head: X}, {})) == quantity
+
+
+def test_columns_of_several_joints_are_one_question(tmp_path: Path) -> None:
+    np.savez(tmp_path / "run.npz", q1=X, q2=V, q3=U, dq1=V, dq2=U, tau1=U, tau2=X)
+    draft = describe(tmp_path)
+    asked = [q for q in draft.questions if "The first is taken" in q]
+    assert asked == [
+        "which column is the position, 'q1' or 'q2', 'q3'? The first is taken.",
+        "which column is the force, 'tau1' or 'tau2'? The first is taken.",
+    ]
+    assert not [q for q in draft.questions if q.startswith("what is") and "time" not in q]
+    assert tomllib.loads(draft.columns)["columns"].keys() == {"position", "force"}
+    assert 'not needed: "dq2", a speed' in draft.columns
 
 
 def test_columns_without_heads_are_told_by_their_numbers() -> None:

@@ -43,6 +43,28 @@ def test_dialects_of_one_table_are_one_record(tmp_path: Path, text: str, encodin
     np.testing.assert_allclose(r.time_s, [0.0, 1e-3, 2e-3])
 
 
+def test_columns_without_names_are_numbered(tmp_path: Path) -> None:
+    columns = (
+        '[columns]\ntime = { name = "column 1", unit = "ms" }\nposition = { name = "column 2", unit = "deg" }\n'
+        'force = { name = "column 3" }\n'
+    )
+    (r,) = read_data(_folder(tmp_path, ROWS, columns), AXIS).records
+    np.testing.assert_allclose(r.position, np.radians([0.0, 1.5, 3.0]))
+    np.testing.assert_allclose(r.force, [0.0, 0.25, 0.5])
+
+
+@pytest.mark.parametrize("text", [
+    " Sample   Time     Encoder 1 Pos   Control Effort\n\n[  0   0.000  0   0.0;\n   1   0.009   1500  -0.25;\n];\n",
+    "Sample\tTime\tEncoder 1 Pos\tControl Effort\nA = [\n0\t0.000\t0\t0.0;\n1\t0.009\t1500\t-0.25]\n",
+    "Sample,Time,Encoder 1 Pos,Control Effort\n[0,0.000,0,0.0\n1,0.009,1500,-0.25]\n",
+])  # fmt: skip
+def test_a_matrix_as_matlab_prints_it_is_a_table(tmp_path: Path, text: str) -> None:
+    table = load_table(_folder(tmp_path, text, "") / "run.csv")
+    assert list(table.columns) == ["Sample", "Time", "Encoder 1 Pos", "Control Effort"]
+    np.testing.assert_array_equal(table.columns["Control Effort"], [0.0, -0.25])
+    np.testing.assert_array_equal(table.columns["Encoder 1 Pos"], [0.0, 1500.0])
+
+
 @pytest.mark.parametrize("day", ["2024-02-01 ", "01.02.2024 ", "2024-02-01T", ""])
 def test_a_time_of_day_is_seconds(tmp_path: Path, day: str) -> None:
     rows = "".join(f"{day}12:30:{9.999 + 1e-3 * i:06.3f};{i};0,5\n".replace(".", ",") for i in range(3))
@@ -60,7 +82,7 @@ def test_a_time_of_day_is_seconds(tmp_path: Path, day: str) -> None:
     ("t [ms];angle [deg];M [Nm]", COLUMNS, "no column 'pos'"),
     ("t [ms];pos [deg];M [Nm]", "sample_time_s = 0.01\n" + COLUMNS, "the model says 0.001"),
     ("t [ms];pos [deg];torque [Nm]", "", 'force = { name = "torque [Nm]", unit = "N m" }'),
-    ("0;1;2", COLUMNS, "no names"),
+    ("0;1;2", COLUMNS, "no column 't' for time; has column 1, column 2, column 3"),
     ("t [ms];pos [deg];M [Nm]\n0;x;3", COLUMNS, "line 2"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said(tmp_path: Path, head: str, columns: str, said: str) -> None:
