@@ -88,9 +88,7 @@ def describe(
             for p in effect.parameters
         )
         evidence = [finding.evidence] if finding is not None else []
-        evidence.append(
-            f"without it {100 * saved:.1f} % of the residual energy would come back ({errors:.1f} standard errors)"
-        )
+        evidence.append(f"without it, {100 * saved:.1f} % of the residual would return ({errors:.1f} standard errors)")
         numbers = {r.rival: _numbers(r) for r in others if r.effect == name}
         worth = saved, errors, often
         named.append(described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, numbers))

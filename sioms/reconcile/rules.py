@@ -113,16 +113,16 @@ def told_apart(
         Reasons of those ruled out, and of those left open, by name.
     """
     mine = [r for r in rivals if r.effect == name]
-    still = {r.rival: f"leaves only {100 * r.missed:.1f} % of it unexplained" for r in mine if r.open}
+    still = {r.rival: f"leaves only {100 * r.missed:.1f} % of the effect unexplained" for r in mine if r.open}
     ruled = {
-        rival: f"saved {100 * gain:.3g} % where this saved {100 * step.saved:.3g} %"
+        rival: f"removed {100 * gain:.3g} % of the residual where this effect removed {100 * step.saved:.3g} %"
         for step in ladder
         if step.effect == name
         for rival, gain in step.rivals.items()
         if rival in lookalikes and rival not in present and rival not in still
     }
     refitted = {
-        r.rival: f"leaves {100 * r.missed:.1f} % of it unexplained, {r.errors:.1f} standard errors worse"
+        r.rival: f"leaves {100 * r.missed:.1f} % of the effect unexplained, {r.errors:.1f} standard errors worse"
         for r in mine
         if not r.open
     }

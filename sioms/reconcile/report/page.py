@@ -8,7 +8,7 @@ import numpy as np
 
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.report.pictures import pictures
-from sioms.reconcile.report.words import CHANCE, columns, groups, headline, number, places, shrunk, span
+from sioms.reconcile.report.words import CHANCE, columns, groups, headline, in_words, number, places, shrunk, span
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.session import knobs
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Verdict
@@ -40,7 +40,7 @@ def page(v: Verdict, seconds: float) -> Page:
                 p.figure(drawn[name])
 
     _opening(p, v)
-    p.head("Where it disagreed")
+    p.head("Where model and measurement disagreed")
     p.text(_where(v))
     show("places", "spectra")
     if v.effects or v.symbolic:
@@ -50,19 +50,19 @@ def page(v: Verdict, seconds: float) -> Page:
     if v.candidates:
         p.head("What was tried and refused")
         p.text(
-            "These are no findings. The search came to them, and the model with them does not hold, so they have no "
-            "numbers here; model.toml has them switched off."
+            "These are not findings. The search reached them, but the model with them does not hold, so no numbers are "
+            "given; model.toml has them switched off."
         )
         p.items(f"{c.title}: {c.why}" for c in v.candidates)
-    p.head("How far the gap shrank")
+    p.head("Model error before and after")
     _gaps(p, v)
     show("gaps", "curves")
-    p.head("Why it is believed, and what else it could have been")
+    p.head("Evidence, and alternatives")
     for e in (*v.effects, *v.symbolic):
         p.lesser(e.title)
         p.items(_why(e, v))
     if not v.effects and not v.symbolic:
-        p.text("Nothing is named, so there is nothing to believe." if v.candidates else "No effect was identified.")
+        p.text("Nothing is named." if v.candidates else "No effect was identified.")
     _next(p, v)
     p.head("How it was found")
     _ladder(p, v)
@@ -76,25 +76,27 @@ def _opening(p: Page, v: Verdict) -> None:
     """Put the verdict first, with where it disagreed and how far the gap shrank."""
     sets = [[e.name for e in v.effects], *v.alternatives]
     lines = [f"{v.outcome.value} - {headline(v)}"]
-    if v.effects or v.alternatives:
+    if v.alternatives:
         lines.append("; or ".join(" and ".join(v.title(n) or n for n in s) or "nothing" for s in sets))
+    else:
+        lines += [in_words(e) for e in v.effects]
     if v.outcome is Outcome.UNEXPLAINED and v.notes:  # the last of them is why
         lines.append(f"{v.notes[-1][0].upper()}{v.notes[-1][1:]}")
     if where := places(v, 2):
-        lines.append(f"Of the disagreement goes {where}")
-    by = ", by the model that is refused" if v.candidates and not v.effects else ""
-    lines.append(f"On data that took no part{by}, {shrunk(v.speaking)}")
+        lines.append(f"{where[0].upper()}{where[1:]}")
+    by = " of the refused model" if v.candidates and not v.effects else ""
+    lines.append(f"Model error{by} on held-out data, {shrunk(v.speaking)}")
     p.box(COLOURS[v.outcome], lines)
 
 
 def _where(v: Verdict) -> str:
     shown = [q for q in v.places if q.p <= CHANCE][:4]
     if not shown:
-        return "No variable orders the residual of the old model (permutation p > 0.05)."
+        return "The residual of the nominal model depends on no variable (permutation p > 0.05)."
     text = "; ".join(f"{q.variable} {100 * q.explained:.0f} % (p = {q.p:.2f})" for q in shown)
     return (
-        "What the residual of the old model goes with, as the share of its squares that lies in its means over the "
-        f"values of one variable (bars: spread about them; p: how often chance does as well): {text}."
+        "Share of the squared residual of the nominal model that its mean as a function of one variable explains "
+        f"(bars: spread about the mean; p: how often chance does as well): {text}."
     )
 
 
@@ -133,11 +135,11 @@ def _quantity(mine: list[Estimate]) -> tuple[object, ...]:
 def _gaps(p: Page, v: Verdict) -> None:
     of_axis = isinstance(v, AxisVerdict)
     p.text(
-        "Root mean square on samples that took no part in any choice."
+        "Root mean square on held-out samples, which were not used for any choice. Noise alone would leave the floor."
         if of_axis
-        else "Root mean square on touches or loads that took no part in any choice (every fifth). The numbers of the "
-        "model are frozen; "
-        "zero, true load of a touch and level of a ramp are the session's own and are free in all columns."
+        else "Root mean square on held-out touches or loads (every fifth), which were not used for any choice. The "
+        "parameters of the model are fixed; the zero, the true load of a touch and the level of a ramp are estimated "
+        "for the session in all columns."
     )
     head = ["channel", "before", "after", "noise floor", "unit", "floor from", "closed"]
     rows = []
@@ -151,8 +153,8 @@ def _gaps(p: Page, v: Verdict) -> None:
     p.table([*head, "later half, frozen", "later half, session re-estimated"] if of_axis else head, rows)
     if of_axis:
         p.text(
-            "Table and pictures are of the model to which the untouched samples have contributed nothing. The numbers "
-            "of the effects and model.toml come from a last fit to all records after that."
+            "Table and pictures show the model that was fitted without the held-out samples. The parameters of the "
+            "effects and model.toml come from a final fit to all records after that."
         )
 
 
@@ -160,9 +162,9 @@ def _why(e: NamedEffect, v: Verdict) -> Iterator[str]:
     """Tell why an effect is believed, and what else it could have been."""
     yield from e.evidence
     if e.frequency is not None:
-        yield f"it earns its place in {100 * e.frequency:.0f} % of block bootstrap replicates"
-    yield from (f"{t}: ruled out, {x}" for n, x in e.ruled_out.items() if (t := v.title(n)))
-    yield from (f"{t}: not ruled out, it {x}" for n, x in e.open.items() if (t := v.title(n)))
+        yield f"selected in {100 * e.frequency:.0f} % of block bootstrap replicates"
+    yield from (f"ruled out: {t}, which {x}" for n, x in e.ruled_out.items() if (t := v.title(n)))
+    yield from (f"not ruled out: {t}, which {x}" for n, x in e.open.items() if (t := v.title(n)))
 
 
 def _next(p: Page, v: Verdict) -> None:
@@ -171,29 +173,29 @@ def _next(p: Page, v: Verdict) -> None:
         return
     p.head("Next")
     if v.experiment is not None:
-        differ = "their forces then differ" if isinstance(v, AxisVerdict) else "they then differ"
+        differ = "there their forces differ" if isinstance(v, AxisVerdict) else "there they differ"
         apart = f"{differ} by {v.experiment.separation:.0f} times the noise"
-        p.text(f"To decide between the look-alikes: {v.experiment.text}; {apart}.")
+        p.text(f"To decide between the candidates: {v.experiment.text}; {apart}.")
     if v.missing:
-        p.text("Not excited by these records, and so not judged (with the record that would show it):")
+        p.text("Not judged, because these records do not excite it (with the record that would):")
         p.items(f"{t}: {x}" for n, x in v.missing.items() if (t := v.title(n)))
     if v.pairs:
         alike = "; ".join(f"{a} and {b} ({100 * c:.0f} % in common)" for a, b, c in v.pairs)
-        p.text(f"Look the same in these records: {alike}.")
+        p.text(f"Indistinguishable in these records: {alike}.")
     for note in v.notes:
         p.text(note)
 
 
 def _ladder(p: Page, v: Verdict) -> None:
-    head, rows = ["step", "effect", "residual over expected"], []
+    head, rows = ["step", "effect", "residual / expected noise"], []
     if isinstance(v, AxisVerdict):
-        head.append(f"force error, untouched, {v.nominal.force_unit}")
+        head.append(f"force error, held out, {v.nominal.force_unit}")
         rows += [["channel", f.effect, "", "", f.evidence] for f in v.findings]
     for i, s in enumerate(v.ladder):
         names = " to ".join(f"{t} ({n})" if (t := v.title(n)) else n for n in s.effect.split(" to "))
         error = [Cell(number(v.rungs[i]))] if isinstance(v, AxisVerdict) else []
         rows.append([s.action, names, Cell(f"{s.ratio:.2f}"), *error, _rivals(s.rivals)])
-    p.table([*head, "what its rivals saved on held-out blocks"], rows)
+    p.table([*head, "reduction by alternatives, on blocks held out"], rows)
 
 
 def _rivals(rivals: Mapping[str, float]) -> str:
@@ -206,8 +208,8 @@ def _session(p: Page, v: AxisVerdict) -> None:
     units = {"offset": v.model.force_unit, "zero": v.model.position_unit}
     shown = knobs(v.model)
     p.text(
-        "Session parameters, estimated on the first half of what is untouched of each record (no property of the axis, "
-        "and no part of the model):"
+        "Session parameters, estimated on the first half of the held-out part of each record (not properties of the "
+        "axis and not part of the model):"
     )
     rows = [
         [name, *(Cell(f"{number(getattr(state, k))} {units.get(k, '')}".rstrip()) for k in shown)]
@@ -218,15 +220,15 @@ def _session(p: Page, v: AxisVerdict) -> None:
 
 def _footing(v: Verdict) -> str:
     """Say on how much all this stands."""
-    smoother = f"a generic smoother over the state explains {100 * v.smoother_share:.0f} % more"
+    smoother = f"a generic smoother over the state would explain another {100 * v.smoother_share:.0f} %"
     if isinstance(v, SensorVerdict):
         floors = ", ".join(f"{n} {r:.2f}" for n, r in v.floors.items() if r > 0.0)
         return (
-            f"{v.samples} numbers (the main view's count as {v.effective_samples:.0f} independent ones); residual of "
-            f"the final model in units of the floor: {floors}; {smoother}."
+            f"{v.samples} readings (those of the main view equal {v.effective_samples:.0f} independent ones); residual "
+            f"of the final model relative to the floor: {floors}; {smoother}."
         )
     return (
-        f"{v.samples} samples count as {v.effective_samples:.0f} independent ones; the residual of the final model is "
-        f"{v.ratio:.2f} of the expected innovation; {smoother}; {100 * v.burst_share:.0f} % of the residual lies in "
-        "the loudest tenth."
+        f"{v.samples} samples equal {v.effective_samples:.0f} independent ones; the residual of the final model is "
+        f"{v.ratio:.2f} times the expected innovation; {smoother}; {100 * v.burst_share:.0f} % of the residual lies in "
+        "the largest tenth."
     )

@@ -72,7 +72,7 @@ def _gap_picture(figure: Figure, gaps: Sequence[Gap]) -> Figure:
     ax.xaxis.set_major_formatter("{x:g}")
     ax.set_yticks(range(len(gaps)), [g.channel for g in reversed(gaps)], fontsize=8)
     ax.set_ylim(-0.6, len(gaps) - 0.4)
-    ax.set_xlabel("simulated - measured over the noise floor, on what took no part", fontsize=8)
+    ax.set_xlabel("(simulated - measured) / noise floor, held-out data", fontsize=8)
     figure.legend(loc="outside right upper", fontsize=8)
     return figure
 
@@ -171,7 +171,7 @@ def _curve_picture(figure: Figure, v: SensorVerdict) -> Figure:
         upper.plot(c.at, c.after, color="#08a", lw=1, label="simulated, after")
         used = ~c.apart
         upper.plot(c.at[used], c.measured[used], ".", color="#9aa6b1", ms=3, label="measured, used")
-        upper.plot(c.at[c.apart], c.measured[c.apart], ".", color="#1c2733", ms=5, label="measured, took no part")
+        upper.plot(c.at[c.apart], c.measured[c.apart], ".", color="#1c2733", ms=5, label="measured, held out")
         upper.set_title(c.title, fontsize=8, loc="left")
         lower.plot(c.at, c.before - c.measured, color="#c50", lw=0.8)
         lower.plot(c.at, c.after - c.measured, color="#08a", lw=0.8)

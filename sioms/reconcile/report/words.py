@@ -12,10 +12,10 @@ from sioms.reconcile.session import knobs
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Verdict
 
 HEAD = {
-    Outcome.NONE: "Nothing is missing: the model agrees with the measurement down to the noise.",
-    Outcome.NAMED: "Found what the model lacks.",
-    Outcome.UNEXPLAINED: "Something is missing that no effect of the library explains.",
-    Outcome.AMBIGUOUS: "Something is missing, but these records cannot tell which of the look-alikes it is.",
+    Outcome.NONE: "Nothing is missing: model and measurement agree to within the noise.",
+    Outcome.NAMED: "What the model lacks has been identified.",
+    Outcome.UNEXPLAINED: "Something is missing, and no effect of the library explains it.",
+    Outcome.AMBIGUOUS: "Something is missing, but these records cannot distinguish between the candidates.",
 }
 LINES = 10
 #: Permutations do as well no oftener than this: a variable orders a disagreement.
@@ -25,7 +25,7 @@ CHANCE = 0.05
 def headline(v: Verdict) -> str:
     """One sentence."""
     if v.outcome is Outcome.UNEXPLAINED and v.effects:
-        return "Found part of what the model lacks; beside it something remains that no effect of the library explains."
+        return "Part of what the model lacks has been identified; no effect of the library explains the rest."
     if v.candidates:
         return "Something is missing, and no model that was tried holds: nothing is named."
     return HEAD[v.outcome]
@@ -52,19 +52,20 @@ def summary(v: Verdict, out: str) -> list[str]:
     more = []
     if v.alternatives:
         sets = [[e.name for e in v.effects], *v.alternatives]
-        more.append("  not told apart: " + " or ".join(" + ".join(s) or "nothing" for s in sets))
+        more.append("  candidates: " + " or ".join(" + ".join(s) or "nothing" for s in sets))
     if v.experiment is not None:
-        apart = f"rivals differ by {v.experiment.separation:.0f} times the noise"
-        more.append(f"  decide by: {v.experiment.text} ({apart})")
+        apart = f"there the candidates differ by {v.experiment.separation:.0f} times the noise"
+        more.append(f"  to decide: {v.experiment.text} ({apart})")
     if where := places(v, 3):
-        more.append(f"where: of the disagreement goes {where}")
+        more.append(f"where: {where}")
     if v.effects:
         ruled = ", ".join(v.effects[0].ruled_out)
         more.append(f"why: {v.effects[0].evidence[-1]}" + (f"; ruled out: {ruled}" if ruled else ""))
     if v.candidates:
-        more.append(f"tried and refused, not found: {', '.join(c.title for c in v.candidates)}")
+        more.append(f"tried and refused: {', '.join(c.title for c in v.candidates)}")
     more += [f"note: {note}" for note in reversed(v.notes)]
-    of = "gap on untouched data" if not v.candidates or v.effects else "gap on untouched data, by the refused model"
+    of = "model error on held-out data"
+    of += ", refused model" if v.candidates and not v.effects else ""
     last = [f"{of}, {shrunk(v.speaking)}", f"report: {out}"]
     return [*lines, *more[: LINES - len(lines) - len(last)], *last]
 
@@ -76,10 +77,10 @@ def shrunk(gap: Gap) -> str:
 
 
 def places(v: Verdict, most: int) -> str:
-    """Say with which variables the disagreement goes, the strongest first; empty where with none."""
+    """Say on which variables the disagreement depends, the strongest first; empty where on none."""
     shown = [p for p in v.places if p.p <= CHANCE][:most]
-    parts = [f"{100 * p.explained:.0f} % with {p.variable}" for p in shown]
-    return f"{', '.join(parts)} (permutation p <= {max(p.p for p in shown):.2f})" if shown else ""
+    parts = ", ".join(f"{p.variable} ({100 * p.explained:.0f} %)" for p in shown)
+    return f"the disagreement depends on {parts}; permutation p <= {max(p.p for p in shown):.2f}" if shown else ""
 
 
 def in_words(e: NamedEffect) -> str:

@@ -62,8 +62,8 @@ def verdict() -> AxisVerdict:
 def test_the_terminal_names_nothing_and_says_what_was_refused() -> None:
     lines = summary(verdict(), "report.html")
     assert lines[0].endswith("Something is missing, and no model that was tried holds: nothing is named.")
-    assert "tried and refused, not found: Stribeck friction (low-speed drop)" in lines
-    assert any(line.startswith("gap on untouched data, by the refused model") for line in lines)
+    assert "tried and refused: Stribeck friction (low-speed drop)" in lines
+    assert any(line.startswith("model error on held-out data, refused model") for line in lines)
     assert not any("Fc" in line for line in lines)
 
 
@@ -71,7 +71,7 @@ def test_the_page_has_no_numbers_of_what_was_refused(tmp_path: Path) -> None:
     page(verdict(), 1.0).write(tmp_path / "report.html")
     text = re.sub(r"data:image[^'\"]*", "", (tmp_path / "report.html").read_text())
     assert "What was tried and refused" in text
-    assert "These are no findings" in text
+    assert "These are not findings" in text
     assert "What was missing" not in text
     assert "Fc" not in text
 
