@@ -88,15 +88,25 @@ def drivers() -> list[EntryPoint]:
 
 
 def page_of(name: str) -> str:
-    """Return the docstring of an installed driver's module, which is read and not imported; '' when there is none."""
+    """Return what shows the configuration of an installed driver: the TOML file beside its module that is called as
+    the module is, or else the module's docstring, which is read and not imported; '' when there is none.
+    """
     found = [entry for entry in drivers() if entry.name == name]
-    return _docstring(found[0]) if found else ""
+    if not found:
+        return ""
+    source = _source(found[0])
+    example = source.with_suffix(".toml") if source else None
+    return example.read_text(encoding="utf-8") if example and example.is_file() else _docstring(found[0])
+
+
+def _source(entry: EntryPoint) -> Path | None:
+    spec = find_spec(entry.module)
+    return Path(spec.origin) if spec and spec.origin else None
 
 
 def _docstring(entry: EntryPoint) -> str:
-    spec = find_spec(entry.module)
-    source = Path(spec.origin).read_text(encoding="utf-8") if spec and spec.origin else ""
-    return ast.get_docstring(ast.parse(source)) or ""
+    source = _source(entry)
+    return ast.get_docstring(ast.parse(source.read_text(encoding="utf-8"))) or "" if source else ""
 
 
 def _driver(entry: EntryPoint) -> tuple[str, str, str]:

@@ -3,73 +3,8 @@
 A device made of devices, see drivers/compound/README.md. With a table ``squeeze`` d takes force commands: an internal
 force [N], positive squeezes. In free space d then yields as a virtual spring about where it was, in contact it follows
 the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. The node
-``force`` shows that force and how late all this is. etc/hand.toml is a whole hand with fingers that feel.
-
-    [device.hand]
-    driver = "hand"
-    axes = ["left.x", "left.y", "left.th", "right.x", "right.y", "right.th"]
-    axis = [
-        { name = "x", velocity_max = 0.1, acceleration_max = 1.0 },
-        { name = "y", velocity_max = 0.1, acceleration_max = 1.0 },
-        { name = "psi", velocity_max = 0.2, acceleration_max = 2.0 },
-        { name = "d", velocity_max = 0.1, acceleration_max = 1.0 },
-        { name = "phi1", velocity_max = 0.5, acceleration_max = 5.0 },
-        { name = "phi2", velocity_max = 0.5, acceleration_max = 5.0 },
-    ]
-    [device.left]
-    driver = "sim-axes"
-    [[device.left.axis]]
-    name = "x"
-    position_min = -0.6
-    position_max = 0.6
-    velocity_max = 0.5
-    acceleration_max = 5.0
-    force_max = 60.0
-    motor = { mass = 1.4, viscous = 50.0, start = -0.2 }
-    [[device.left.axis]]
-    name = "y"
-    position_min = -0.6
-    position_max = 0.6
-    velocity_max = 0.5
-    acceleration_max = 5.0
-    force_max = 60.0
-    motor = { mass = 1.4, viscous = 50.0, start = 0.14 }
-    [[device.left.axis]]
-    name = "th"
-    unit = "rad"
-    position_min = -6.0
-    position_max = 6.0
-    velocity_max = 3.0
-    acceleration_max = 30.0
-    force_max = 0.8
-    motor = { mass = 0.01, viscous = 0.05, start = -1.57 }
-    [device.right]
-    driver = "sim-axes"
-    [[device.right.axis]]
-    name = "x"
-    position_min = -0.6
-    position_max = 0.6
-    velocity_max = 0.5
-    acceleration_max = 5.0
-    force_max = 60.0
-    motor = { mass = 1.4, viscous = 50.0, start = 0.2 }
-    [[device.right.axis]]
-    name = "y"
-    position_min = -0.6
-    position_max = 0.6
-    velocity_max = 0.5
-    acceleration_max = 5.0
-    force_max = 60.0
-    motor = { mass = 1.4, viscous = 50.0, start = -0.14 }
-    [[device.right.axis]]
-    name = "th"
-    unit = "rad"
-    position_min = -6.0
-    position_max = 6.0
-    velocity_max = 3.0
-    acceleration_max = 30.0
-    force_max = 0.8
-    motor = { mass = 0.01, viscous = 0.05, start = 1.57 }
+``force`` shows that force and how late all this is. hand.toml is an example without a sense of
+touch, etc/hand.toml a whole hand with fingers that feel.
 
 Lengths in metres, angles in radians.
 """

@@ -1,37 +1,7 @@
 """A pair of slits: two blades that leave a gap; coordinates centre and gap.
 
-A device made of devices, see drivers/compound/README.md. The held axes may be of any device; here they are simulated.
-
-    [device.slits]
-    driver = "slits"
-    axes = ["blades.minus", "blades.plus"]
-    least_m = 0.0
-    [[device.slits.axis]]
-    name = "centre"
-    velocity_max = 0.05
-    acceleration_max = 0.5
-    [[device.slits.axis]]
-    name = "gap"
-    velocity_max = 0.05
-    acceleration_max = 0.5
-    [device.blades]
-    driver = "sim-axes"
-    [[device.blades.axis]]
-    name = "minus"
-    position_min = -0.5
-    position_max = 0.5
-    velocity_max = 0.2
-    acceleration_max = 2.0
-    force_max = 20.0
-    motor = { mass = 1.0, viscous = 4.0 }
-    [[device.blades.axis]]
-    name = "plus"
-    position_min = -0.5
-    position_max = 0.5
-    velocity_max = 0.2
-    acceleration_max = 2.0
-    force_max = 20.0
-    motor = { mass = 1.0, viscous = 4.0 }
+A device made of devices, see drivers/compound/README.md. slits.toml is an example whose
+held axes are simulated; they may be of any device.
 """
 
 from __future__ import annotations
