@@ -1,10 +1,11 @@
-"""What a DriveBank wants its driver to send."""
+"""What a DriveBank wants its driver to send, and how its commands end."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import Enum
 
+from . import modes
 from .commands import Command
 
 
@@ -43,3 +44,22 @@ class DriveAction:
     def is_stop(self) -> bool:
         """Tell whether it stops the axis and must overtake everything else."""
         return self.kind in (ActionKind.STOP, ActionKind.QUICK_STOP)
+
+
+def ends_by_itself(command: Command) -> bool:
+    """Tell whether a drive's own 'done' ends a command."""
+    mode = command.control_mode
+    return bool(mode & modes.POSITION) and not (mode & modes.TIME)
+
+
+def is_force(command: Command | None) -> bool:
+    """Tell whether a command is one of force."""
+    return command is not None and bool(command.control_mode & modes.ANY_FORCE)
+
+
+def is_open_ended(command: Command) -> bool:
+    """Tell whether a command lasts until the next one arrives."""
+    mode = command.control_mode
+    if mode & modes.TIME:
+        return command.time < 0
+    return not mode & modes.POSITION

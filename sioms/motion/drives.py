@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from . import modes
-from .actions import ActionKind, DriveAction
+from .actions import ActionKind, DriveAction, ends_by_itself, is_force, is_open_ended
 from .arrival import Approach
 from .bank import Axes, Bank
 from .commands import Command, is_point_move
@@ -108,7 +108,7 @@ class DriveBank(Bank):
 
     def _is_open_ended(self, axes: Axes) -> NDArray[np.bool_]:
         running = [self._running[axis] for axis in axes]
-        lasting = np.array([c is not None and _is_open_ended(c) for c in running], dtype=bool)
+        lasting = np.array([c is not None and is_open_ended(c) for c in running], dtype=bool)
         return np.asarray(~self._active[axes] | lasting)
 
     def _begin(self, axes: Axes, now_ns: int, *, replace: bool) -> None:
@@ -171,7 +171,7 @@ class DriveBank(Bank):
             now_ns: the instant.
         """
         chosen = np.asarray(axes, dtype=np.int64)
-        forces = [a for a in chosen.tolist() if _is_force(self._running[a])]
+        forces = [a for a in chosen.tolist() if is_force(self._running[a])]
         self._queue.emit(EventKind.DROPPED, chosen, now_ns, errno.ERANGE, text)
         self._halt(chosen, now_ns, fastest=False)
         self._outcome[chosen] |= int(side)
@@ -401,7 +401,7 @@ class DriveBank(Bank):
                 self._end(axis, now_ns)
             elif self._homing[axis] and reached[axis]:
                 self._homed(axis, now_ns)
-            elif reached[axis] and command is not None and _ends_by_itself(command):
+            elif reached[axis] and command is not None and ends_by_itself(command):
                 self._arrive(axis, command, now_ns)
 
     def _arrive(self, axis: int, command: Command, now_ns: int) -> None:
@@ -475,7 +475,7 @@ class DriveBank(Bank):
         self._watch.order(axis, Order.HOLD)
         self._queue.load_heads(one)
         if not self._queue.has_head[axis]:
-            if was_stop or command is None or _ends_by_itself(command):
+            if was_stop or command is None or ends_by_itself(command):
                 self._queue.emit(EventKind.IDLE, one, now_ns)
             else:
                 self._halt(one, now_ns, fastest=False)
@@ -488,7 +488,7 @@ class DriveBank(Bank):
         for axis in np.flatnonzero(free).tolist():
             running = self._running[axis]
             if self._active[axis] and running is not None:
-                if not _is_open_ended(running):
+                if not is_open_ended(running):
                     continue
                 self._end(axis, now_ns)
             self._start(axis, now_ns)
@@ -565,8 +565,8 @@ class DriveBank(Bank):
         status = self._queue.latched | self._outcome
         status |= np.where(busy, int(AxisStatus.MOVING), 0)
         status |= np.where(self._stopping, int(AxisStatus.STOPPING), 0)
-        if any(_is_force(command) for command in self._running):
-            forces = np.array([_is_force(command) for command in self._running])
+        if any(is_force(command) for command in self._running):
+            forces = np.array([is_force(command) for command in self._running])
             status |= np.where(forces & self._active, int(AxisStatus.FORCE_MODE), 0)
         status |= np.where(self._queue.gated_marker & ~running, int(AxisStatus.WAITING_MARKER), 0)
         status |= np.where(self._queue.gated_synch & ~running, int(AxisStatus.WAITING_SYNCH), 0)
@@ -580,22 +580,3 @@ def _order_of(command: Command) -> tuple[Order, float]:
     if mode & modes.POSITION:
         return Order.POINT, command.position
     return (Order.RUN, command.velocity) if mode & modes.VELOCITY else (Order.FORCE, 0.0)
-
-
-def _ends_by_itself(command: Command) -> bool:
-    """Tell whether the drive's own 'done' ends this command."""
-    mode = command.control_mode
-    return bool(mode & modes.POSITION) and not (mode & modes.TIME)
-
-
-def _is_force(command: Command | None) -> bool:
-    """Tell whether this command is one of force."""
-    return command is not None and bool(command.control_mode & modes.ANY_FORCE)
-
-
-def _is_open_ended(command: Command) -> bool:
-    """Tell whether this command lasts until the next one arrives."""
-    mode = command.control_mode
-    if mode & modes.TIME:
-        return command.time < 0
-    return not mode & modes.POSITION

@@ -310,6 +310,30 @@ def _velocity_goal(command: Command, state: State, bounds: Bounds) -> tuple[floa
     return max(-bounds.velocity, min(bounds.velocity, state[1] + ramp)), bounds
 
 
+def plan_force(command: Command, present: float, limit: float) -> Plan:
+    """Return force over time as a plan: a constant, or a ramp up to a limit and on.
+
+    Args:
+        command: one of force.
+        present: the force that a ramp begins from [N or Nm].
+        limit: the largest force, >= 0.
+    """
+    mode, time = command.control_mode, command.time
+    duration = time if mode & modes.TIME and time > 0 else math.inf
+    if mode & modes.FORCE:
+        level = command.force
+        return Plan([(duration, level, 0.0, 0.0, 0.0, 0.0, 0.0)], duration, (level, 0.0, 0.0), True)
+    present = max(-limit, min(limit, present))
+    rate = command.force_velocity
+    goal = math.copysign(limit, rate)
+    ramp = (goal - present) / rate if rate else math.inf
+    if ramp >= duration:
+        end = present + rate * duration if rate else present
+        return Plan([(duration, present, rate, 0.0, 0.0, 0.0, 0.0)], duration, (end, 0.0, 0.0), True)
+    segments = [(ramp, present, rate, 0.0, 0.0, 0.0, 0.0), (duration - ramp, goal, 0.0, 0.0, 0.0, 0.0, 0.0)]
+    return Plan(segments, duration, (goal, 0.0, 0.0), True)
+
+
 def _segments(profile: ruckig.Profile) -> list[Segment]:
     segments: list[Segment] = []
     for part in (profile.brake, profile, profile.accel):

@@ -2,9 +2,8 @@
 
 An axis always runs exactly one plan: a hold at rest, a command, or a brake. It begins where the one before ended, but
 for axes that cannot follow: their stops begin where they are, and commands that break off others no farther ahead than
-their force reaches. The plan of the next
-command is made ahead, in the slack between ticks, when the state it begins in is known; then its
-start is a few array operations for all axes that start together, a thousand as well as one.
+their force reaches. The plan of the next command is made ahead, in the slack between ticks, when the state it begins in
+is known; then its start is a few array operations for all axes that start together, a thousand as well as one.
 Concurrency: that of the bank.
 """
 
@@ -24,7 +23,7 @@ from .arrival import Approach, Arrivals, plan_point
 from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, SETTLING, STOP
 from .commands import Command, is_point_move
 from .law import ControlLaw
-from .profile import Bounds, InfeasibleError, Plan, Planner, State
+from .profile import Bounds, InfeasibleError, Plan, Planner, State, plan_force
 from .queue import CommandQueue
 from .settings import AxisSettings
 from .store import UNCUT_NS, PlanStore
@@ -576,29 +575,9 @@ class Sequencer:
         )
 
     def _plan_force(self, axis: int, command: Command) -> Plan:
-        """Return force over time as a plan: a constant, or a ramp up to the force limit and on."""
-        mode, time = command.control_mode, command.time
-        duration = time if mode & modes.TIME and time > 0 else math.inf
-        if mode & modes.FORCE:
-            level = command.force
-            return Plan([(duration, level, 0.0, 0.0, 0.0, 0.0, 0.0)], duration, (level, 0.0, 0.0), True)
-        limit = command.max_force if mode & modes.MAX_FORCE else float(self._law.force_limit[axis])
-        if self.kind[axis] == FORCE:
-            present = float(self.store.final[self.store.row[axis], 0])
-        else:
-            present = float(self._law.output[axis])
-        present = max(-limit, min(limit, present))
-        rate = command.force_velocity
-        goal = math.copysign(limit, rate)
-        ramp = (goal - present) / rate if rate else math.inf
-        if ramp >= duration:
-            end = present + rate * duration if rate else present
-            return Plan([(duration, present, rate, 0.0, 0.0, 0.0, 0.0)], duration, (end, 0.0, 0.0), True)
-        segments = [
-            (ramp, present, rate, 0.0, 0.0, 0.0, 0.0),
-            (duration - ramp, goal, 0.0, 0.0, 0.0, 0.0, 0.0),
-        ]
-        return Plan(segments, duration, (goal, 0.0, 0.0), True)
+        limit = command.max_force if command.control_mode & modes.MAX_FORCE else float(self._law.force_limit[axis])
+        present = self.store.final[self.store.row[axis], 0] if self.kind[axis] == FORCE else self._law.output[axis]
+        return plan_force(command, float(present), limit)
 
     def _refuse(self, axis: int, text: str, now_ns: int) -> None:
         """A command turned out infeasible: drop the buffer and latch a fault; the axis brakes and holds."""
