@@ -1,4 +1,10 @@
-"""What every axis must do, whichever driver it belongs to."""
+"""What every axis must do, whichever driver it belongs to.
+
+What a driver adds to the kit is tried on the axes of all: places, velocities, and what is refused. What the kit does
+alone is tried once for each kind of bank, on a simulated axis, whose loop is closed here, and on a drive with a loop of
+its own. The stops of every driver with a line, from more states and in more ways, are trials of ``sioms driver check``:
+docs/decisions/0730-what-is-tried-on-every-driver.md.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +23,8 @@ from sioms.protocol.flags import AxisStatus, ControlMode
 
 AXES = [axis for rig in RIGS for axis in rig.axes]
 every_axis = pytest.mark.parametrize("axis", AXES, ids=lambda axis: axis.node)
-# The driver check makes the stops of every driver with a line, from more states and in more ways.
+BANKS = [axis for axis in AXES if axis.node in ("sim_axes.servo", "tmcl")]
+every_bank = pytest.mark.parametrize("axis", BANKS, ids=lambda axis: axis.node)
 UNCHECKED = [axis for rig in RIGS if not rig.line for axis in rig.axes]
 every_unchecked_axis = pytest.mark.parametrize("axis", UNCHECKED, ids=lambda axis: axis.node)
 
@@ -38,6 +45,10 @@ def run(node: sioms.AxisNode, axis: Axis) -> None:
         node.command(velocity=axis.velocity)
     else:
         node.move(0.9, max_velocity=axis.velocity, max_acceleration=0.2)
+
+
+def test_both_kinds_of_bank_are_tried() -> None:
+    assert len(BANKS) == 2, "an axis of the rigs is called otherwise"
 
 
 @every_axis
@@ -142,7 +153,7 @@ def _latched(node: sioms.AxisNode) -> sioms.client.snapshot.AxisSnapshot | None:
     return reading if reading.status[0] & AxisStatus.EMERGENCY_STOP else None
 
 
-@every_axis
+@every_bank
 def test_markers_hold_and_signal(cell: sioms.Workcell, axis: Axis) -> None:
     first, second = cell.reserve_markers(2)
     with cell.open(axis.node, "rw", timeout=2.0) as node:
@@ -160,7 +171,7 @@ def test_markers_hold_and_signal(cell: sioms.Workcell, axis: Axis) -> None:
         home(node)
 
 
-@every_axis
+@every_bank
 def test_a_synch_releases(cell: sioms.Workcell, axis: Axis) -> None:
     with cell.open(axis.node, "rw", timeout=2.0) as node:
         home(node)
@@ -174,7 +185,7 @@ def test_a_synch_releases(cell: sioms.Workcell, axis: Axis) -> None:
         home(node)
 
 
-@every_axis
+@every_bank
 def test_commands_run_in_order_and_flush_leaves_the_first(cell: sioms.Workcell, axis: Axis) -> None:
     with cell.open(axis.node, "rw", timeout=2.0) as node:
         home(node)
@@ -204,7 +215,7 @@ def test_commands_run_in_order_and_flush_leaves_the_first(cell: sioms.Workcell, 
             marker.free()
 
 
-@every_axis
+@every_bank
 def test_calibration_moves_nothing(cell: sioms.Workcell, axis: Axis) -> None:
     with cell.open(axis.node, "rw", timeout=2.0) as node:
         home(node)
@@ -215,7 +226,7 @@ def test_calibration_moves_nothing(cell: sioms.Workcell, axis: Axis) -> None:
         wait_for(lambda: node.read().position[0] == pytest.approx(0.0, abs=axis.tolerance), "zeroed")
 
 
-@every_axis
+@every_bank
 def test_tweaks_add_up_also_in_coordinates_of_ones_own(cell: sioms.Workcell, axis: Axis) -> None:
     with cell.open(axis.node, "rw", timeout=2.0) as node:
         home(node)
@@ -235,7 +246,7 @@ def test_tweaks_add_up_also_in_coordinates_of_ones_own(cell: sioms.Workcell, axi
         assert node.read().position[0] == pytest.approx(0.0, abs=2 * axis.tolerance)
 
 
-@every_axis
+@every_bank
 def test_limits_are_told_and_narrowed(cell: sioms.Workcell, axis: Axis) -> None:
     with cell.open(axis.node, "rw", timeout=2.0) as node:
         home(node)
@@ -250,7 +261,7 @@ def test_limits_are_told_and_narrowed(cell: sioms.Workcell, axis: Axis) -> None:
         home(node)
 
 
-@every_axis
+@every_bank
 def test_a_frozen_client_with_a_lease_is_halted(workcell: Daemon, cell: sioms.Workcell, axis: Axis) -> None:
     node = cell.open(axis.node, "rw", timeout=2.0, lease=0.15)
     node.move(0.0)

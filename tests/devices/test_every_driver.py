@@ -16,6 +16,9 @@ from device_rigs import GROUPS, RIGS, Rig, group_of
 import sioms
 
 every_rig = pytest.mark.parametrize("rig", RIGS, ids=lambda rig: rig.title)
+# The driver check kills the drivers with a line in motion, and that of converters.
+UNCHECKED = [rig for rig in RIGS if not rig.line and rig.driver != "iio"]
+every_unchecked_rig = pytest.mark.parametrize("rig", UNCHECKED, ids=lambda rig: rig.title)
 
 
 OVER_OTHERS = {"gantry", "hand", "slits"}
@@ -75,7 +78,7 @@ def test_statistics_are_told(cell: sioms.Workcell, rig: Rig) -> None:
             assert report["link"]["received_bytes"] > 0
 
 
-@every_rig
+@every_unchecked_rig
 def test_a_killed_driver_is_refused_and_comes_back(workcell: Daemon, cell: sioms.Workcell, rig: Rig) -> None:
     before = workcell.device(rig.device)
     others = {r.device: workcell.device(r.device)["pid"] for r in GROUPS[group_of(rig) or 0] if r is not rig}
