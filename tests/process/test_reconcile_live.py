@@ -201,27 +201,11 @@ def test_an_interrupted_experiment_leaves_the_axis_halted_and_free(daemon: Daemo
 
 
 def test_nothing_moves_without_consent_and_a_node_of_another_kind_is_refused(daemon: Daemon, tmp_path: Path) -> None:
-    run = workflow(daemon, tmp_path)
-    assert run.wait_exit(120.0) == 2
-    assert "--yes" in said(run)
+    (tmp_path / "wrong").mkdir()
+    silent = workflow(daemon, tmp_path)
+    wrong = workflow(daemon, tmp_path / "wrong", "--yes", model=MODEL.replace("linear", "rotary"))
+    for run, words in ((silent, "--yes"), (wrong, "it is in m, the model in rad")):
+        assert run.wait_exit(120.0) == 2
+        assert words in said(run)
     with daemon.cell() as session:
         assert session.open("mod0.xaxis.readonly").read().position[0] == 0.0
-    (tmp_path / "nominal.toml").write_text(MODEL.replace("linear", "rotary"))
-    wrong = Running(
-        [
-            sys.executable,
-            "-m",
-            "sioms.reconcile",
-            "axis",
-            "mod0.xaxis",
-            "--model",
-            str(tmp_path / "nominal.toml"),
-            "--socket",
-            daemon.socket,
-            "--yes",
-        ],
-        {},
-        None,
-    )
-    assert wrong.wait_exit(120.0) == 2
-    assert "it is in m, the model in rad" in said(wrong)

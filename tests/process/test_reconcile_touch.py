@@ -139,14 +139,14 @@ def test_an_interrupted_probing_leaves_the_indenter_clear_at_rest_and_free(cell:
 
 
 def test_without_consent_or_with_wrong_nodes_nothing_is_pressed(cell: Path, tmp_path: Path) -> None:
-    run = workflow(cell, tmp_path)
-    assert run.wait_exit(120.0) == 2
-    assert "--yes" in said(run)
-    hard = workflow(cell, tmp_path, "--yes", "--load", "400")
-    assert hard.wait_exit(120.0) == 2
-    assert "400 N/m" in said(hard)
-    wrong = workflow(cell, tmp_path, "--yes", "--place", "prober.radial")
-    assert wrong.wait_exit(120.0) == 2
-    assert "no single axis in rad" in said(wrong)
+    refused = {
+        "--yes": (),
+        "400 N/m": ("--yes", "--load", "400"),
+        "no single axis in rad": ("--yes", "--place", "prober.radial"),
+    }
+    runs = {words: workflow(cell, tmp_path, *options) for words, options in refused.items()}
+    for words, run in runs.items():
+        assert run.wait_exit(120.0) == 2
+        assert words in said(run)
     with sioms.Workcell(str(cell / "prober.sock"), "test") as session:
         assert session.open("prober.radial.readonly").read().position[0] < SURFACE_M
