@@ -46,9 +46,20 @@ MARKERS = {
 }
 
 
+DURATIONS = Path(__file__).with_name("durations.json")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     for name, meaning in MARKERS.items():
         config.addinivalue_line("markers", f"{name}: {meaning}")
+    config.option.loadscopereorder = False  # files are handed to workers in the order of their first tests below
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the files that take longest, so that no worker is left with one when the others have ended."""
+    taken: dict[str, float] = json.loads(DURATIONS.read_text()) if DURATIONS.exists() else {}
+    items.sort(key=lambda item: -taken.get(item.nodeid.partition("::")[0], 0.0))
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

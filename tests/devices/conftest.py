@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 from daemon_rig import Daemon
 from device_rigs import GROUPS, at_work, group_of
 
 import sioms
-
-DURATIONS = Path(__file__).parents[1] / "durations.json"
 
 
 def _group(item: pytest.Item) -> int | None:
@@ -25,22 +21,16 @@ def _group(item: pytest.Item) -> int | None:
     return next((number for number in found if number is not None), 0)
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Let files be handed out in the order of their first tests below, not by how many tests they have."""
-    config.option.loadscopereorder = False
-
-
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with the drivers' check, which takes longer than all else and mostly waits; put the tests of one workcell
-    together, and of the other files those first that take longest.
+    together.
     """
-    taken: dict[str, float] = json.loads(DURATIONS.read_text()) if DURATIONS.exists() else {}
 
-    def place(item: pytest.Item) -> tuple[int, float]:
+    def place(item: pytest.Item) -> int:
         if "shipped" in getattr(item, "fixturenames", ()):
-            return -1, 0.0
+            return -1
         group = _group(item)
-        return (len(GROUPS), -taken.get(item.nodeid.partition("::")[0], 0.0)) if group is None else (group, 0.0)
+        return len(GROUPS) if group is None else group
 
     items.sort(key=place)
 

@@ -1,4 +1,4 @@
-"""``./dev``: an environment in a folder with blanks, one that was moved with its tree, and steps that are slow."""
+"""``./dev``: an environment in a folder with blanks, one that was moved with its tree."""
 
 import importlib.machinery
 import importlib.util
@@ -66,39 +66,6 @@ def test_a_moved_environment_is_mended(dev, tmp_path, monkeypatch, places):
     before = (second / "bin" / "theirs").read_bytes()
     dev.mend_moved()
     assert (second / "bin" / "theirs").read_bytes() == before
-
-
-def test_a_step_ends_when_it_is_silent_and_not_when_it_is_slow(dev, monkeypatch, capfd):
-    monkeypatch.setattr(dev, "QUIET_S", 1.5)  # silence is looked at once a second: it ends after 2 s
-    monkeypatch.setattr(dev.os, "getloadavg", lambda: (0.0, 0.0, 0.0))
-    slow = "import time\nfor _ in range(2): print('.', flush=True); time.sleep(1.2)"
-    assert dev.run_step("slow", [sys.executable, "-c", slow]) == 0
-    hangs = "import time; time.sleep(60)"
-    assert dev.run_step("hangs", [sys.executable, "-c", hangs]) == -1
-    assert "hangs: killed; it has printed nothing" in capfd.readouterr().err
-    monkeypatch.setattr(dev.os, "getloadavg", lambda: (100.0 * dev.os.cpu_count(), 0.0, 0.0))
-    assert dev.run_step("starved", [sys.executable, "-c", "import time; time.sleep(2.3)"]) == 0
-
-
-def test_what_failed_is_run_once_more_and_a_second_failure_counts(dev, monkeypatch, capsys):
-    ran = []
-
-    def step(name, command):
-        ran.append(command)
-        return next(codes)
-
-    monkeypatch.setattr(dev, "run_step", step)
-    timed = ("timed", ["python", "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "tests"])
-    codes = iter([1, 0])
-    assert dev.run_steps([timed]) == 0
-    assert ran[1] == ["python", "-m", "pytest", "-q", "tests", "--lf", "--lfnf=none"]
-    assert "what failed once more" in capsys.readouterr().err
-    codes = iter([1, 1])
-    assert dev.run_steps([timed]) == 1
-    codes = iter([2, 0])  # an interrupted or broken run is not run again
-    assert dev.run_steps([timed]) == 1
-    codes = iter([1, 0])
-    assert dev.run_steps([("style", ["ruff", "check"])]) == 1
 
 
 def test_steps_are_compiled_again_after_a_change_of_any_of_them(dev):
