@@ -108,9 +108,12 @@ def run_steps(steps: list[Step], *, beside: Sequence[Step] = (), then: Sequence[
         beside: at the same time, also one after the other, on the time of the processors that those leave.
         then: after all these, with nothing beside them.
     """
+    if steps:
+        ALONE_AT_LAST.clear()
     with ThreadPoolExecutor(1) as pool, ended_with_us():
         waiting = pool.submit(lambda: [run_timed(step, beside=True) for step in beside if not ENDING.is_set()])
         results = [run_timed(step) for step in steps]
+        go_ahead()
         results = [*waiting.result(), *results]
     results += [run_timed(step) for step in then]
     results = [run_again(result) for result in results]
@@ -125,7 +128,11 @@ def run_timed(step: Step, *, beside: bool = False) -> tuple[Step, int, float]:
     name, command = step
     say(f"{name}: {' '.join(command)}")
     began = time.monotonic()
-    code = run_step(name, command, beside=beside)
+    try:
+        code = run_step(name, command, beside=beside)
+    except OSError as error:
+        say(f"{name}: run {command[0]}: {error.strerror}; ./dev setup installs it")
+        code = 127
     return step, code, time.monotonic() - began
 
 
@@ -156,7 +163,8 @@ def without_workers(command: list[str]) -> list[str]:
 
 RUNNING: set[int] = set()
 """Process groups of the steps that run beside others."""
-ENDING = threading.Event()
+ENDING, ALONE_AT_LAST = threading.Event(), threading.Event()
+"""The run is to end; nothing runs any more that others must give way to."""
 
 
 @contextlib.contextmanager
@@ -179,20 +187,29 @@ def tied(*, beside: bool) -> Callable[[], None]:
     def begin() -> None:
         tie()
         if beside:
-            give_way()
+            os.setsid()
+            if not ALONE_AT_LAST.is_set():
+                put_behind(0, 19)
 
     return begin
 
 
-def give_way() -> None:
-    """Begin a session that gets only the time that others leave.
+def put_behind(group: int, nice: int) -> None:
+    """Let the session of a process group, 0: our own, get only the time that others leave, by 19, or its share, by 0.
 
     Where the scheduler groups processes by session (autogroup), nice values count within one; the group has its own.
     """
-    os.setsid()
-    os.nice(19)
-    with contextlib.suppress(OSError), open("/proc/self/autogroup", "w") as file:
-        file.write("19")
+    with contextlib.suppress(OSError):  # to be nice no more takes rights where there are no such groups
+        os.setpriority(os.PRIO_PGRP, group, nice)
+    with contextlib.suppress(OSError), open(f"/proc/{group or 'self'}/autogroup", "w") as file:
+        file.write(str(nice))
+
+
+def go_ahead() -> None:
+    """Let what runs beside the steps have its share: these have ended."""
+    ALONE_AT_LAST.set()
+    for group in list(RUNNING):
+        put_behind(group, 0)
 
 
 def run_step(name: str, command: list[str], *, beside: bool = False) -> int:
@@ -210,6 +227,8 @@ def run_step(name: str, command: list[str], *, beside: bool = False) -> int:
     ) as process:  # fmt: skip
         if beside:
             RUNNING.add(process.pid)
+            if ALONE_AT_LAST.is_set():  # since the process began
+                put_behind(process.pid, 0)
         try:
             output = cast("IO[bytes]", process.stdout).fileno()
             while True:

@@ -56,14 +56,25 @@ def test_what_failed_is_run_once_more_and_a_second_failure_counts(monkeypatch: A
 
 
 def test_steps_beside_others_give_way_fail_the_run_and_are_shown_whole(tmp_path: Path, capfd: Any) -> None:
-    mine, seen = tmp_path / "mine", "while not os.path.exists(sys.argv[1]): time.sleep(0.01)"
-    front = [*script(f"import os, sys, time\n{seen}"), str(mine)]
-    text = "import os, sys; print(os.nice(0), os.getsid(0) == os.getpid()); open(sys.argv[1], 'w'); sys.exit(3)"
-    steps = [("front", front)]  # ends only if the other runs at the same time
-    assert suite.run_steps(steps, beside=[("beside", [*script(text), str(mine)])]) == 1
+    mark = tmp_path / "mark"
+    front = f"import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)"  # ends only if both run
+    beside = (
+        "import os, time\nprint(os.getsid(0) == os.getpid(), own := os.nice(0), flush=True)\n"
+        f"open({str(mark)!r}, 'w')\nwhile os.geteuid() == 0 and os.nice(0) == own: time.sleep(0.01)\n"
+        "raise SystemExit(3)"  # gets on with its share, if it may, once the other has ended
+    )
+    steps = [("front", script(front))]
+    assert suite.run_steps(steps, beside=[("beside", script(beside))]) == 1
     said = capfd.readouterr()
-    assert "beside:\n19 True\n" in said.out
+    assert "beside:\nTrue 19\n" in said.out
     assert "ok " in said.err and "FAILED" in said.err
+
+
+def test_a_command_that_is_not_there_fails_the_run_with_a_sentence(capfd: Any) -> None:
+    there = ("there", script("print('done')"))
+    assert suite.run_steps([there], beside=[("style", ["/nowhere/ruff"]), there]) == 1
+    said = capfd.readouterr()
+    assert "style: run /nowhere/ruff: No such file or directory" in said.err and said.out.count("done") == 2
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
