@@ -14,7 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from time import monotonic
-from typing import Any
+from typing import Any, TypeAlias
 
 from p4p.nt import NTScalar
 from p4p.server import Server, StaticProvider
@@ -22,6 +22,7 @@ from p4p.server.thread import SharedPV
 
 from sioms.arguments import place, positive
 from sioms.bridges.leases import LEASE_S, Leases
+from sioms.bridges.putters import Putters
 from sioms.client.workcell import Workcell, is_part
 from sioms.protocol.flags import READONLY, AnalogStatus, AxisStatus, NodeClass, Severity
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
@@ -31,6 +32,7 @@ PLACE = "127.0.0.1:5075"
 ASK_S = 0.5
 """How often nodes and alarms are asked for [s]."""
 GONE = "cannot be read"
+Act: TypeAlias = Callable[[float, str, str], None]
 _NUMBER, _WHOLE, _TEXT = NTScalar("d", display=True, control=True), NTScalar("l", display=True), NTScalar("s")
 
 
@@ -41,8 +43,8 @@ def add_parser(subparsers: Any) -> None:
         help="serve nodes to EPICS clients, which may stop and move axes",
         description="A bridge to EPICS PV Access: an ordinary client of the daemon that shows axes as motors, with "
         "read-back, set-point, limits, done-moving and alarm, and analog and binary channels. Whoever reaches the port "
-        "may read, and stop axes by a put to STOP. With --move, clients on this machine may also move axes, each while "
-        "it renews its lease by puts to LEASE.",
+        "may read. Programs on this machine of your own user, of root and of --user may stop axes by a put to STOP "
+        "and, with --move, move them, each while it renews its lease by puts to LEASE.",
     )
     parser.add_argument(
         "--listen", metavar="HOST:PORT", default=PLACE, help=f"address; default {PLACE}, *:5075 for all interfaces"
@@ -50,6 +52,10 @@ def add_parser(subparsers: Any) -> None:
     parser.add_argument("--prefix", metavar="TEXT", default="", help="prefix of all variable names")
     parser.add_argument("--rate", metavar="HZ", type=positive, default=10.0, help="polling rate; default 10 Hz")
     parser.add_argument("--move", action="store_true", help="let clients on this machine move axes, under a lease")
+    parser.add_argument(
+        "--user", metavar="NAME", action="append", default=[], help="who may put from this machine, too; repeatable"
+    )
+    parser.add_argument("--anybody-stops", action="store_true", help="let whoever reaches the port stop axes")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -60,8 +66,10 @@ def run(args: argparse.Namespace) -> int:
             f"listen on {args.listen} with --move: whoever reaches the port could move axes, because PV Access has no"
         )
         raise OSError(errno.EINVAL, f"{text} passwords; want a loopback address, as 127.0.0.1, and a tunnel to it")
-    bridge = Bridge(args.prefix, Leases() if args.move else None)
-    with serve(bridge.provider, host, port):
+    putters = Putters(args.user, anybody_stops=args.anybody_stops)
+    bridge = Bridge(args.prefix, putters, Leases() if args.move else None)
+    with serve(bridge.provider, host, port) as server:
+        putters.here = (host, int(server.conf()["EPICS_PVAS_SERVER_PORT"]))
         print(f"listening on {args.listen}", file=sys.stderr, flush=True)
         ended = threading.Event()
         while not ended.wait(1.0 / args.rate):
@@ -108,10 +116,10 @@ class Shown:
     Args:
         kind: type of its value.
         channel: whose units, limits and description clients see.
-        act: what a put does, with the value and the client; None: nothing can be put.
+        act: what a put does, with the value, and account and address of the client; None: nothing can be put.
     """
 
-    def __init__(self, kind: NTScalar, channel: ChannelInfo, act: Callable[[float, str], None] | None = None) -> None:
+    def __init__(self, kind: NTScalar, channel: ChannelInfo, act: Act | None = None) -> None:
         self._kind, self._channel, self._act = kind, channel, act
         self._last: tuple[str, int, str] | None = None
         self.pv = SharedPV(nt=kind, handler=self)
@@ -122,7 +130,7 @@ class Shown:
             op.done(error=f"put to {op.name()}: it is shown only; only STOP can be put, and with --move LEASE and VAL")
             return
         try:
-            self._act(float(op.value()), f"{printable(op.account(), 32)}@{op.peer()}")
+            self._act(float(op.value()), op.account(), op.peer())
         except (OSError, ValueError, TypeError) as error:
             op.done(error=f"put to {op.name()}: {getattr(error, 'strerror', None) or error}")
         else:
@@ -199,13 +207,14 @@ class Bridge:
 
     Args:
         prefix: what the names of all variables begin with.
+        putters: judges who may put.
         leases: by which clients hold nodes; None: they move nothing.
 
     Concurrency: ``look`` in one thread; puts in any.
     """
 
-    def __init__(self, prefix: str, leases: Leases | None = None) -> None:
-        self._leases = leases
+    def __init__(self, prefix: str, putters: Putters, leases: Leases | None = None) -> None:
+        self._leases, self._putters = leases, putters
         self.provider = StaticProvider("sioms")
         self._prefix = prefix
         self._shown: dict[str, Shown] = {}
@@ -276,18 +285,29 @@ class Bridge:
                 act = self._mover(name, channel.name) if moves else None
                 self._post(name, f":{channel.name}{field}", kind, channel, act).post(value, *alarm, stamp_s)
             if info.node_class is NodeClass.AXIS:
-                stop = self._post(name, f":{channel.name}.STOP", _WHOLE, channel, lambda on, _: self._stop(name, on))
+                act = self._judged(lambda on, _: self._stop(name, on), stops=True)
+                stop = self._post(name, f":{channel.name}.STOP", _WHOLE, channel, act)
                 stop.post(0, 0, "", stamp_s)
         if self._leases is not None and info.node_class is NodeClass.AXIS:
             of = ChannelInfo("", "s", *LEASE_S, description="put again in time by who moves the node; 0: let go")
             leases = self._leases
-            lease = self._post(name, ".LEASE", _NUMBER, of, lambda seconds, who: leases.put(name, who, seconds))
+            act = self._judged(lambda seconds, who: leases.put(name, who, seconds))
+            lease = self._post(name, ".LEASE", _NUMBER, of, act)
             lease.post(*leases.shown(name), stamp_s)
 
-    def _mover(self, node: str, channel: str) -> Callable[[float, str], None] | None:
+    def _mover(self, node: str, channel: str) -> Act | None:
         if (leases := self._leases) is None:
             return None
-        return lambda position, who: leases.move(node, who, channel, position)
+        return self._judged(lambda position, who: leases.move(node, who, channel, position))
+
+    def _judged(self, act: Callable[[float, str], None], *, stops: bool = False) -> Act:
+        """Return a put that is judged before it is done; ``act`` takes the value, and the client in words."""
+
+        def judged(value: float, account: str, peer: str) -> None:
+            self._putters.judge(peer, stops=stops)
+            act(value, f"{printable(account, 32)}@{peer}")
+
+        return judged
 
     def _post(self, node: str, what: str, *words: Any) -> Shown:
         """Return the variable of a name, made where there is none yet."""

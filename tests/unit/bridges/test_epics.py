@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -15,6 +18,7 @@ pytest.importorskip("p4p", reason="needs the extra epics")
 from p4p.client.thread import Context, RemoteError
 
 from sioms.bridges import epics
+from sioms.bridges.putters import Putters
 from sioms.protocol.flags import AxisStatus, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 
@@ -87,7 +91,7 @@ def cell(monkeypatch: pytest.MonkeyPatch) -> Cell:
 
 @pytest.fixture
 def bridge(cell: Cell) -> epics.Bridge:
-    made = epics.Bridge("lab:")
+    made = epics.Bridge("lab:", Putters())
     made.look()
     return made
 
@@ -95,6 +99,7 @@ def bridge(cell: Cell) -> epics.Bridge:
 @contextmanager
 def serving(bridge: epics.Bridge) -> Iterator[Context]:
     with epics.serve(bridge.provider, "127.0.0.1", 0) as server:
+        bridge._putters.here = ("127.0.0.1", int(server.conf()["EPICS_PVAS_SERVER_PORT"]))
         place = f"127.0.0.1:{server.conf()['EPICS_PVAS_SERVER_PORT']}"
         conf = {"EPICS_PVA_NAME_SERVERS": place, "EPICS_PVA_ADDR_LIST": "", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}
         with Context("pva", conf=conf, useenv=False) as context:
@@ -180,7 +185,7 @@ def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -
         put=lambda *words: calls.append(words), move=lambda *words: calls.append(words), shown=lambda _: (0.5, 0, "x"),
         sweep=lambda: None,
     )  # fmt: skip
-    bridge = epics.Bridge("", held)  # type: ignore[arg-type]
+    bridge = epics.Bridge("", Putters(), held)  # type: ignore[arg-type]
     bridge.look()
     with serving(bridge) as client:
         client.put("mod0.LEASE", 0.5, timeout=5.0)
@@ -197,3 +202,53 @@ def test_where_one_cannot_listen_is_told(bridge: epics.Bridge) -> None:
         epics.serve(bridge.provider, "127.0.0.1", taken.getsockname()[1])
     with pytest.raises(OSError, match=r"listen on no\.such\.address:5999: "):
         epics.serve(bridge.provider, "no.such.address", 5999)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two users")
+def test_a_stranger_of_this_machine_reads_but_puts_nothing(cell: Cell) -> None:
+    """He may say of himself what he likes: the kernel knows who has made his connection."""
+    calls: list[Any] = []
+    held = SimpleNamespace(
+        put=lambda *words: calls.append(words), move=lambda *words: calls.append(words), shown=lambda _: (0.5, 0, "x"),
+        sweep=lambda: None,
+    )  # fmt: skip
+    bridge = epics.Bridge("", Putters(), held)  # type: ignore[arg-type]
+    bridge.look()
+    puts = [("mod0.LEASE", 0.5), ("mod0:xaxis.VAL", 0.1), ("mod0:xaxis.STOP", 1)]
+    with serving(bridge):
+        here = "{}:{}".format(*bridge._putters.here)
+        told = as_stranger(here, puts)
+        assert all(f"put to {name}: user {STRANGER}; want one of user root on this machine" in told for name, _ in puts)
+        assert "read 0.125" in told
+        assert not calls and not cell.node.stops
+        bridge._putters._uids.add(STRANGER)
+        assert "put to" not in as_stranger(here, puts)
+        assert (len(calls), cell.node.stops) == (2, 1)
+        bridge._putters = Putters(anybody_stops=True)
+        bridge._putters.here = ("*", int(here.rpartition(":")[2]))
+        told = as_stranger(here, puts)
+        assert told.count("put to") == 2 and "STOP" not in told, told
+        assert (len(calls), cell.node.stops) == (2, 2)
+
+
+STRANGER = 60123
+
+
+def as_stranger(place: str, puts: list[tuple[str, float]]) -> str:
+    """Read and put as another user; return what he was told."""
+    program = f"""
+import os
+os.environ["USER"] = os.environ["LOGNAME"] = "root"
+from p4p.client.thread import Context, RemoteError
+os.setuid({STRANGER})
+conf = {{"EPICS_PVA_NAME_SERVERS": "{place}", "EPICS_PVA_ADDR_LIST": "", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}}
+with Context("pva", conf=conf, useenv=False) as context:
+    print("read", float(context.get("mod0:xaxis.RBV", timeout=5.0)))
+    for name, value in {puts!r}:
+        try:
+            context.put(name, value, timeout=5.0)
+        except RemoteError as error:
+            print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=30.0, check=True)
+    return done.stdout
