@@ -172,7 +172,6 @@ class DriverProcess:
         self._sock = ours
         options = dict(
             self.options,
-            realtime_priority=self.device.common.realtime_priority,
             user=self.device.common.user,
             process=self.process,
             lease_s=self._lease_s,

@@ -11,7 +11,7 @@ import pwd
 import stat
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -29,6 +29,7 @@ from .fork_server_process import ForkServerProcess
 from .lines import with_lines
 from .loop import Loop, Timer
 from .names import DeviceInfo, NameTable, Node, shared_claims
+from .needs import priorities
 from .patience import Patience
 
 UNWATCHED = ("changed_ns", "flags", "status")
@@ -209,7 +210,7 @@ class Loader:
         # Names of devices that failed would only be missed again as targets of aliases.
         names = NameTable({n: self._infos[n] for n in self._config.devices if n in self._infos}, self._config.nodes)
         self._errors += _unknown_users(self._config) + shared_claims(names.devices.values())
-        self._errors += _not_together(names.devices, self._config)
+        self._errors += _not_together(names, self._config)
         sources, alarms = self._stop_sources(names), self._alarms(names)
         if not self._errors:
             self._errors += names.errors
@@ -311,10 +312,11 @@ def _unknown_users(config: Config) -> list[str]:
     return errors
 
 
-def _not_together(devices: Mapping[str, DeviceInfo], config: Config) -> Iterator[str]:
+def _not_together(names: NameTable, config: Config) -> Iterator[str]:
     """Tell the devices that cannot share the process that they shall, for a line of their own or as another's."""
     firsts: dict[str, tuple[str, dict[str, object]]] = {}
-    for name, info in devices.items():
+    of_all = priorities(names, config)
+    for name, info in names.devices.items():
         common = config.devices[name].common
         if not common.process:
             continue
@@ -323,8 +325,7 @@ def _not_together(devices: Mapping[str, DeviceInfo], config: Config) -> Iterator
                 f"[device.{name}]: process = {common.process}: its driver has a line; want a process of its own, or a "
                 "driver without one, as those of simulated devices"
             )
-        priority = info.realtime_priority if common.realtime_priority is None else common.realtime_priority
-        wanted: dict[str, object] = {"user": common.user or "none", "realtime_priority": priority}
+        wanted: dict[str, object] = {"user": common.user or "none", "realtime_priority": of_all[name]}
         first, there = firsts.setdefault(common.process, (name, wanted))
         for key in wanted:
             if wanted[key] != there[key]:

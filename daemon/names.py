@@ -184,7 +184,7 @@ class NameTable:
                 continue  # told as an input
             if node.read_only or self.block(node).node_class is not NodeClass.AXIS:
                 yield f"holds node {name}, which takes no motion commands; want a node of axes"
-            elif device.name in self._held_by(node.device):
+            elif device.name in self.made_of(node.device):
                 yield f"holds node {name} of device {node.device}, which is made of this one; want no ring of devices"
             else:
                 for claim in node.claims():
@@ -194,7 +194,7 @@ class NameTable:
                         yield f"holds axis {axis} of node {name}, which device {owner} holds; want one holder an axis"
                         break
 
-    def _held_by(self, device: str) -> set[str]:
+    def made_of(self, device: str) -> set[str]:
         """Return a device, and all whose axes it holds, directly or not."""
         found, new = {device}, [device]
         while new:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from sioms.protocol.flags import NodeClass
 
 from .config import Config
-from .names import DeviceInfo
+from .names import DeviceInfo, NameTable
 from .realtime import SHARE
 
 PERIOD, RUNTIME = "/proc/sys/kernel/sched_rt_period_us", "/proc/sys/kernel/sched_rt_runtime_us"
@@ -135,20 +135,28 @@ def crowded(needs: Mapping[str, float], config: Config) -> list[str]:
     return found
 
 
-def realtime_devices(devices: Mapping[str, DeviceInfo], config: Config) -> list[str]:
-    """Return the names of the devices whose drivers ask for a real-time class."""
-    found = []
-    for name, info in devices.items():
-        wanted = config.devices[name].common.realtime_priority
-        if info.realtime_priority if wanted is None else wanted:
-            found.append(name)
+def priorities(names: NameTable, config: Config) -> dict[str, int]:
+    """Return the real-time priority of each device's driver, 0 for none.
+
+    The configuration has the last word, then the driver. A device made of devices comes one below the first of what it
+    holds: real axes do not wait for an ordinary process to stop them, and not for a long tick of their holder either.
+    """
+    own = {name: info.realtime_priority for name, info in names.devices.items()}
+    given = {name: config.devices[name].common.realtime_priority for name in own}
+    own |= {name: priority for name, priority in given.items() if priority is not None}
+    found = {}
+    for name, priority in own.items():
+        below = [own[each] for each in names.made_of(name) - {name} if each in own]
+        held = max(below, default=0)
+        found[name] = priority if given[name] is not None else max(priority, held - 1, min(held, 1))
     return found
 
 
-def told(devices: Mapping[str, DeviceInfo], config: Config, machine: Machine) -> tuple[str, list[str]]:
+def told(names: NameTable, config: Config, machine: Machine) -> tuple[str, list[str]]:
     """Return what the drivers of a configuration need, and why that does not fit on a machine, where it does not."""
-    needs = {name: need(info) for name, info in devices.items()}
-    found = shortages(needs, realtime_devices(devices, config), machine)
+    needs = {name: need(info) for name, info in names.devices.items()}
+    realtime = [name for name, priority in priorities(names, config).items() if priority]
+    found = shortages(needs, realtime, machine)
     return summary(needs, machine), found + crowded(needs, config)
 
 

@@ -33,7 +33,7 @@ from .loading import Loader, Plan, mistake
 from .log import Log
 from .loop import Loop
 from .names import NameTable, Node, part_name
-from .needs import this_machine, told
+from .needs import priorities, this_machine, told
 from .realtime import LOOK_S, Budget, make_ordinary, realtime_use
 from .rights import Rights
 from .shared import Shared
@@ -419,7 +419,8 @@ class Server:
         names, old = self.names, self._fork_server
         self.config, self.names, self._fork_server = plan.config, plan.names, plan.fork_server
         self._watched_inputs = plan.watched_inputs
-        self._options = {name: self._options_of(name, plan) for name in plan.config.devices}
+        of_all = priorities(plan.names, plan.config)
+        self._options = {name: self._options_of(name, plan, of_all[name]) for name in plan.config.devices}
         self.alarms.look_at_plan(plan)
         self.clients.take_up_rights(rights)
         try:
@@ -428,7 +429,7 @@ class Server:
             why = f"{error.filename or 'the stop-request file'}: {error.strerror}"
         if why:
             self.log("warning", "stop without the daemon", why=why)
-        needed, shortages = told(plan.names.devices, plan.config, this_machine())
+        needed, shortages = told(plan.names, plan.config, this_machine())
         self.log("debug", "processors", needed=needed)
         for shortage in shortages:
             self.log("warning", "does not fit", why=shortage)
@@ -453,7 +454,7 @@ class Server:
         self.clients.nodes.retry_opens()
         self._maybe_ready()
 
-    def _options_of(self, name: str, plan: Plan) -> dict[str, Any]:
+    def _options_of(self, name: str, plan: Plan, priority: int) -> dict[str, Any]:
         """Return what a driver is told beside its own settings."""
         return {
             "stop_sources": plan.stop_sources.get(name, []),
@@ -461,6 +462,7 @@ class Server:
             "daemon_lease_s": plan.config.workcell.daemon_lease_s,
             "folder": plan.config.folder,
             "state_folder": plan.config.state_folder(os.environ),
+            "realtime_priority": priority,
             # Golden-ratio steps: however many drivers there are, their ticks do not fall together. Those of one process
             # do: they need one wake.
             "phase": (plan.config.processes.index(plan.config.process_of(name)) * 0.6180339887) % 1.0,

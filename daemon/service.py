@@ -111,7 +111,7 @@ def check(path: str, process: ForkServerProcess) -> int:
             plan.fork_server.close()
             kinds = len(plan.names.nodes)
             print(f"{path}: ok; {len(plan.config.devices)} devices, {kinds} nodes")
-            needed, shortages = told(plan.names.devices, plan.config, this_machine())
+            needed, shortages = told(plan.names, plan.config, this_machine())
             print(f"{path}: {needed}")
             for shortage in shortages:
                 print(f"{path}: warning: {shortage}", file=sys.stderr)

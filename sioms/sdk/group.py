@@ -139,9 +139,7 @@ class Group:
         if errors:
             raise ValueError("; ".join(errors))
         runtime = Runtime(driver, device, settings, generation, options, fds)
-        wanted = options["realtime_priority"]
-        priority = driver.realtime_priority if wanted is None else int(wanted)
-        return Member(runtime, fds[1:], priority, str(options["user"]))
+        return Member(runtime, fds[1:], int(options["realtime_priority"]), str(options["user"]))
 
     def _start(self, member: Member) -> None:
         runtime = member.runtime

@@ -41,15 +41,22 @@ class Held:
         most_ns: longest time that an answer may take [ns].
         now_ns: the time [ns, CLOCK_MONOTONIC].
         told: sends the daemon a message.
+        watch, unwatch: have its answers heard as soon as they come, and not any more; by descriptor.
 
     Attributes:
         channels: its axes; empty while it is not there.
         shows_reset_ns: see ``HeldNode``.
     """
 
-    def __init__(self, name: str, most_ns: int, now_ns: Callable[[], int], told: Callable[[Message], None]) -> None:
+    def __init__(
+        self, name: str, most_ns: int, now_ns: Callable[[], int], told: Callable[[Message], None],
+        watch: Callable[[int], None] = lambda fd: None, unwatch: Callable[[int], None] = lambda fd: None,
+    ) -> None:  # fmt: skip
         self.name = name
         self._most_ns, self._now_ns, self._told = most_ns, now_ns, told
+        self._watch_fd, self._unwatch_fd = watch, unwatch
+        self._heard: OSError | None = None
+        """Trouble that has been heard between two ticks."""
         self._asked: deque[tuple[int, int]] = deque()
         """Numbers of what is not answered yet, and when it was asked [ns]; not of the watch, which lasts."""
         self.channels: tuple[ChannelInfo, ...] = ()
@@ -65,15 +72,23 @@ class Held:
         self._record[1] = _JOG
 
     def attach(self, fd: int, channels: Sequence[Sequence[Any]]) -> None:
-        """Take the node: the socket of its handle, and its packed channels."""
+        """Take the node: the socket of its handle, and its packed channels.
+
+        Where it was held until now its device has been lost and is there again, sooner than a tick has come: that is
+        trouble all the same, as what it does now is not what was asked of it.
+        """
+        if self._sock is not None:
+            self._heard = self._heard or OSError(errno.EIO, f"{self.name}: its device was lost, and is another now")
         self.detach()
         self._sock = socket.socket(fileno=fd)
         self._sock.setblocking(False)
         self.channels = tuple(ChannelInfo(*channel) for channel in channels)
+        self._watch_fd(self._sock.fileno())
 
     def detach(self) -> None:
         """Let the node go: its axes halt."""
         if self._sock is not None:
+            self._unwatch_fd(self._sock.fileno())
             self._sock.close()
         self._sock, self.channels, self._watch, self._reset, self.shows_reset_ns = None, (), 0, 0, 0
         self._driven, self._wanted = 0, None
@@ -129,12 +144,18 @@ class Held:
         """Renew the lease."""
         self._send(Keepalive().packed())
 
+    def hear(self) -> OSError | None:
+        """Take the answers before the next tick does; return trouble, once; the tick is told of it, too."""
+        known = self._heard is not None
+        self._heard = self.trouble()
+        return None if known else self._heard
+
     def trouble(self) -> OSError | None:
         """Take the answers; return why it does not do as it was told, None when it does.
 
         A node whose handle has ended is not held any more.
         """
-        found: OSError | None = None
+        found, self._heard = self._heard, None
         for _ in range(_MOST_ANSWERS):
             if self._sock is None:
                 break

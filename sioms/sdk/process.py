@@ -32,5 +32,4 @@ def run(
     """
     name_process(f"sioms:{device}")
     runtime = Runtime(driver, device, settings, generation, options, fds)
-    wanted = options["realtime_priority"]
-    return runtime.run(driver.realtime_priority if wanted is None else int(wanted), str(options["user"]))
+    return runtime.run(int(options["realtime_priority"]), str(options["user"]))

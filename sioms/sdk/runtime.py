@@ -15,6 +15,7 @@ import select
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,7 +36,7 @@ from .alarm_watch import AlarmWatch
 from .attachments import SHARES, Attachments
 from .blocks import AnyBlock, AxisBlock
 from .control import Control
-from .driver import Driver
+from .driver import AtLimitError, Driver
 from .effects import Effects
 from .engines import make_engine
 from .exchange import HookError
@@ -95,7 +96,10 @@ class Runtime:
         description = driver.describe(device, settings)
         self.inputs: dict[str, Input] = {name: Input(name) for name in description.reads}
         lease_ns = int(float(options.get("lease_s") or description.lease_s) * 1e9)
-        self.held: dict[str, Held] = {name: Held(name, lease_ns, self.now_ns, self.tell) for name in description.holds}
+        self.held: dict[str, Held] = {
+            name: Held(name, lease_ns, self.now_ns, self.tell, partial(self._watch_held, name), self.unwatch)
+            for name in description.holds
+        }
         self._description = description
         self._epoll = select.epoll()
         self._callbacks: dict[int, Callable[[], None]] = {}
@@ -183,6 +187,31 @@ class Runtime:
         """Stop watching; call before closing."""
         if self._callbacks.pop(fd, None) is not None:
             self._epoll.unregister(fd)
+
+    def _watch_held(self, name: str, fd: int) -> None:
+        """Hear what is held where ticks are seldom; frequent ones hear it as soon, and then each answer costs none."""
+        if self._lead_ns:
+            self.watch(fd, partial(self._hear_held, name))
+
+    def _hear_held(self, name: str) -> None:
+        """Take answers; when one axis of a device made of devices is lost or stopped, the others are stopped at once.
+
+        A node that was stopped at its own limit leaves the others to a tick, which brakes them together.
+        """
+        trouble = self.held[name].hear()
+        if trouble is None:
+            return
+        if isinstance(trouble, AtLimitError):
+            self.tick_early()
+        else:
+            self._stop_held()
+
+    def _stop_held(self) -> None:
+        """Stop all that is held, and have a tick that says why."""
+        for held in self.held.values():
+            held.stop()
+        self._wake()
+        self.tick_early()
 
     def set_line_timer(self, when_ns: int | None) -> None:
         """Have the engine's ``line_due`` called at a time, None = not; of a TickEngine, an early tick."""
@@ -578,7 +607,10 @@ class Runtime:
                 if not fds:
                     self.log("error", f"{name} cannot be held: too many open descriptors")
                     return
+                was_held = self.held[name].is_there
                 self.held[name].attach(fds[0], channels)
+                if was_held:
+                    self._stop_held()
             case driver_verbs.NodeStop() | driver_verbs.NodeReset():
                 block, channels, bit, text, resets = message
                 self.stops.heed()  # a reset that came before it must not come after it

@@ -38,6 +38,14 @@ history = 4096
 )
 
 
+SLOW = (
+    CELL.replace("span_m = 1.0", "span_m = 1.0\ntick_hz = 2.0")
+    .replace("lease_s = 0.5", "lease_s = 2.5\nhang_s = 2.5")
+    .replace("acceleration_max = 4.0\n", "acceleration_max = 4.0\ngain = 0.1\n")
+    .replace("acceleration_max = 1.0\n", "acceleration_max = 1.0\ngain = 0.1\n")
+)
+
+
 def go(node: sioms.Node, **fields: list[float]) -> None:
     """Write a command to each coordinate."""
     node.write([sioms.command(i, **{name: values[i] for name, values in fields.items()}) for i in range(3)])
@@ -136,3 +144,20 @@ def test_a_gantry_drives_what_it_holds_and_all_halt_together(start_daemon: Calla
         daemon.wait_up("mod1", before["generation"] + 1)
         bridge = _recovered(cell)
         bridge.close()
+
+
+def test_a_slow_one_stops_what_is_left_without_waiting_for_its_tick(start_daemon: Callable[..., Daemon]) -> None:
+    daemon = start_daemon(SLOW)
+    with daemon.cell() as cell:
+        daemon.wait_up("bridge")
+        bridge = cell.open("bridge", "rw")
+        with cell.open("mod0.readonly", "r") as below:
+            wait_for(lambda: _reads(bridge), "the bridge has found its axes")
+            go(bridge, velocity=[0.02, 0.02, 0.0])
+            wait_for(lambda: max(map(abs, below.read().velocity)) > 0.01, "it moves")
+            ticked_ns = bridge.read().stamp_ns
+            wait_for(lambda: bridge.read().stamp_ns > ticked_ns, "a tick has just been")
+            ticked_ns = bridge.read().stamp_ns
+            os.kill(daemon.device("mod1")["pid"], signal.SIGKILL)
+            wait_for(lambda: max(map(abs, below.read().velocity)) < 1e-3, "the others halt")
+            assert below.read().stamp_ns - ticked_ns < 450_000_000, "a tick would come after half a second"

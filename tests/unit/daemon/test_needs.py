@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from sioms.daemon.config import parse
-from sioms.daemon.names import BlockInfo, DeviceInfo
-from sioms.daemon.needs import Machine, need, realtime_devices, shortages, summary, this_machine
+from sioms.daemon.names import BlockInfo, DeviceInfo, NameTable
+from sioms.daemon.needs import Machine, need, priorities, shortages, summary, this_machine
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.finding import describe, find_driver, read_settings
@@ -16,12 +16,15 @@ from sioms.sdk.finding import describe, find_driver, read_settings
 TWO = Machine(2, 1.4)
 
 
-def device(kind: str, tick_hz: float, *blocks: tuple[NodeClass, int], priority: int = 0) -> DeviceInfo:
+def device(
+    kind: str, tick_hz: float, *blocks: tuple[NodeClass, int], priority: int = 0, holds: tuple[str, ...] = (),
+    name: str = "d",
+) -> DeviceInfo:  # fmt: skip
     made = tuple(
         BlockInfo(str(i), cls, tuple(ChannelInfo(f"c{c}") for c in range(count)), False, 64, 0)
         for i, (cls, count) in enumerate(blocks)
     )
-    return DeviceInfo("d", "driver", made, tick_hz, (), 0.1, kind=kind, realtime_priority=priority)
+    return DeviceInfo(name, "driver", made, tick_hz, (), 0.1, kind=kind, realtime_priority=priority, holds=holds)
 
 
 def test_the_estimate_is_near_what_was_measured() -> None:
@@ -98,5 +101,21 @@ def test_the_configuration_has_the_last_word_on_real_time(tmp_path: Path) -> Non
         str(tmp_path),
     )
     assert config is not None and not errors
-    infos = {name: device("tick", 1.0, priority=50 if name != "c" else 0) for name in "abc"}
-    assert realtime_devices(infos, config) == ["a", "c"]
+    infos = {name: device("tick", 1.0, priority=50 if name != "c" else 0, name=name) for name in "abc"}
+    assert priorities(NameTable(infos, {}), config) == {"a": 50, "b": 0, "c": 7}
+
+
+def test_what_is_made_of_real_devices_comes_right_behind_them(tmp_path: Path) -> None:
+    tables = [f'[device.{name}]\ndriver = "x"\n' for name in ("real", "simulated", "low", "over", "top", "toy", "last")]
+    text = '[workcell]\nname = "t"\n' + "".join(tables) + '[device.told]\ndriver = "x"\nrealtime_priority = 0\n'
+    config, errors = parse(text, str(tmp_path))
+    assert config is not None and not errors
+    held = {"over": ("real", "simulated"), "top": ("over",), "toy": ("simulated",), "last": ("low",), "told": ("real",)}
+    own = {"real": 50, "low": 1}
+    axis = (NodeClass.AXIS, 1)
+    infos = {
+        n: device("tick", 1.0, axis, priority=own.get(n, 0), holds=tuple(f"{h}.0" for h in held.get(n, ())), name=n)
+        for n in config.devices
+    }
+    found = priorities(NameTable(infos, {}), config)
+    assert {name: found[name] for name in held} == {"over": 49, "top": 49, "toy": 0, "last": 1, "told": 0}

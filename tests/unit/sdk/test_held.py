@@ -151,3 +151,30 @@ def test_refusals_from_before_a_reset_tell_nothing_and_its_own_does(driver: Driv
     driver.sock.send(refusal(number, errno.EAGAIN, "stopped since", 9))
     assert "stopped since" in str(held.trouble())
     assert held.shows_reset_ns == 9
+
+
+def test_a_device_that_is_lost_and_there_again_before_anybody_looks_has_been_lost(driver: Driver) -> None:
+    driver.held.drive([1.0])
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    with theirs:
+        driver.held.attach(ours.detach(), [])
+        assert "was lost" in str(driver.held.trouble()) and driver.held.trouble() is None
+        driver.held.detach()
+        again, _ = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        driver.held.attach(again.detach(), [])
+        assert driver.held.trouble() is None, "who has let go, or was told, hears nothing more"
+
+
+def test_what_is_heard_between_two_ticks_is_told_once_and_kept_for_the_tick(driver: Driver) -> None:
+    watched: list[int] = []
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    held = Held("x", MOST_NS, lambda: driver.now_ns, driver.told.append, watched.append, watched.remove)
+    held.attach(ours.detach(), [])
+    assert len(watched) == 1
+    held.drive([1.0])
+    assert held.hear() is None
+    theirs.close()
+    heard = held.hear()
+    assert heard is not None and "does not serve it any more" in str(heard) and not watched
+    assert held.hear() is None, "once, or what it brings about would call it again"
+    assert held.trouble() is heard and held.trouble() is None
