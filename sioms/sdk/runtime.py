@@ -40,7 +40,7 @@ from .driver import AtLimitError, Driver
 from .effects import Effects
 from .engines import make_engine
 from .exchange import HookError
-from .failing import fail
+from .failing import TRIES, fail, free_reserve
 from .handles import LOOKS_A_MS, Handle, Waits
 from .held import Held
 from .idling import Idling
@@ -518,11 +518,17 @@ class Runtime:
 
     def fail(self, error: Exception) -> None:
         """Stop first, report second: the driver has raised what it should not have."""
-        until_ns = time.monotonic_ns() + FAIL_GRACE_NS
-        fail(error, self.stops, self.engine, lambda: self._run_line(until_ns), self.log)
+        for _ in range(TRIES):
+            try:
+                free_reserve()
+                fail(error, self.stops, self.engine, self._run_line, self.log)
+                return
+            except MemoryError:
+                continue
 
-    def _run_line(self, until_ns: int) -> None:
+    def _run_line(self) -> None:
         """Let the line send what is left to send; nothing else runs any more."""
+        until_ns = time.monotonic_ns() + FAIL_GRACE_NS
         others = {self._control.fileno(), self._timer.fd}
         while not self.engine.is_quiet() and time.monotonic_ns() < until_ns:
             for fd, _ in self._epoll.poll(0.005):
