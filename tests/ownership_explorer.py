@@ -141,6 +141,49 @@ def explore(way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lam
     return graph, first, reached
 
 
+def explore_all(way: Iterable[Action], requests: int) -> tuple[int, int]:
+    """Go through all states that can come about with so many requests, deaths and other events in all, in whatever
+    order they and what happens by itself come; return how many these are, and the steps between them.
+
+    What happens by itself comes to rest without a request, so that there is an end.
+
+    Raises:
+        Broken: a promise does not hold; with the steps that lead there.
+    """
+    state = State()
+    for action in way:
+        state, _ = follow(state, action)
+    first = typical(state)
+    came: dict[State, tuple[State, Action] | None] = {first: None}
+    taken, done, count = {first: 0}, set[State](), 0
+    rests: set[State] = set()
+    front = [first]
+    for used in range(requests + 1):
+        new: list[State] = []
+        while front:
+            state = front.pop()
+            if state in done:
+                continue  # it was reached with less
+            done.add(state)
+            for action in actions(state):
+                by_itself = action[0] in SYSTEM
+                if not by_itself and used == requests:
+                    continue
+                try:
+                    after, _ = follow(state, action)
+                except Broken as error:
+                    raise Broken(f"{error}, after {trace(came, state)} and then {action}") from None
+                count += 1
+                alike, cost = typical(after), used + (not by_itself)
+                if alike not in taken:
+                    _see_rest(alike, rests)
+                if cost < taken.get(alike, requests + 1):
+                    came[alike], taken[alike] = (state, action), cost
+                    (front if by_itself else new).append(alike)
+        front = new
+    return len(done), count
+
+
 def _see_rest(state: State, rests: set[State]) -> None:
     """See that nothing is left of who has gone when all comes to rest; ``rests``: states of which that is known."""
     passed = []
@@ -388,6 +431,7 @@ def main(arguments: list[str]) -> int:
     """Explore, walk, and tell how far it went."""
     parser = argparse.ArgumentParser(description="Explore the protocol of ownership and stops on the real objects.")
     parser.add_argument("--model-depth", type=int, default=0, help="steps from each beginning, in the model only")
+    parser.add_argument("--requests", type=int, default=0, help="how many in all, to the end, in the model only")
     parser.add_argument("--depth", type=int, default=0, help="steps from each beginning, taken by the real objects")
     parser.add_argument("--walks", type=int, default=0, help="random walks of 400 steps")
     parser.add_argument("--seed", type=int, default=0, help="of the first walk")
@@ -397,6 +441,9 @@ def main(arguments: list[str]) -> int:
             graph, _, reached = explore(begin(name), options.model_depth)
             steps = sum(map(len, graph.values()))
             print(f"model, {name}: depth {reached}: {len(graph)} states, {steps} steps between them", flush=True)
+        if options.requests:
+            states, steps = explore_all(begin(name), options.requests)
+            print(f"model, {name}: all of {options.requests} requests: {states} states, {steps} steps", flush=True)
         if options.depth:
             found = run(name, options.depth)
             print(

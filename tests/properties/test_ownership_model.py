@@ -16,6 +16,7 @@ from ownership_explorer import (
     begin,
     check_rest,
     explore,
+    explore_all,
     run,
     settle,
     wander,
@@ -61,6 +62,13 @@ def test_no_promise_is_broken_in_any_state_of_the_model(name: str) -> None:
     """Three clients, two devices, a death at every step."""
     graph, _, reached = explore(begin(name), DEPTH + 2)
     assert reached == DEPTH + 2 and len(graph) > 100
+
+
+@pytest.mark.parametrize("name", BEGINNINGS)
+def test_no_promise_is_broken_by_all_that_one_event_can_bring_about(name: str) -> None:
+    """To the end: whatever happens by itself after one request, death or reload, in every order."""
+    states, steps = explore_all(begin(name), 1)
+    assert steps > states > 50
 
 
 @pytest.mark.parametrize("name", BEGINNINGS)
