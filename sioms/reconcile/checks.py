@@ -91,12 +91,13 @@ def check_record(r: Record, model: AxisModel) -> None:
         ("force_measured", r.force_measured, "the drive's current"),
         ("command", r.command, "the command that was followed"),
     ):
-        if (
-            a is not None
-            and np.ptp(a) == 0.0
-            and (name == "force" or np.ptp(r.position) >= LEAST_COUNTS * model.resolution)
-        ):
-            raise BadInputError(f"{where}: {name} is constant at {a[0]:.6g}; needs {what}, or no such column")
+        if a is None or np.ptp(a) != 0.0 or (name == "force" and not model.driven):
+            continue
+        if name == "force" or np.ptp(r.position) >= LEAST_COUNTS * model.resolution:
+            instead = (
+                "driven = false in [axis] of the model where nothing drives it" if name == "force" else "no such column"
+            )
+            raise BadInputError(f"{where}: {name} is constant at {a[0]:.6g}; needs {what}, or {instead}")
     if r.time_s is not None:
         _check_time(r, r.time_s, model.sample_time_s)
     top = float(np.max(np.abs(r.force)))

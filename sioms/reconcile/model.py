@@ -50,6 +50,7 @@ class AxisModel:
         controller: None where only recorded forces are at hand.
         effects: values per parameter symbol per effect name; only what is switched on.
         refine: base parameters ("inertia", "viscous") that are uncertain and fitted along, not named.
+        driven: False where the axis has no drive: it swings or coasts freely, or only ``external`` moves it.
     """
 
     rotary: bool
@@ -65,6 +66,7 @@ class AxisModel:
     effects: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
     refine: tuple[str, ...] = ()
     name: str = "axis"
+    driven: bool = True
 
     @property
     def position_unit(self) -> str:

@@ -29,7 +29,7 @@ AXIS_NUMBERS: Mapping[str, tuple[str, float | None]] = {
 ABOVE_ZERO = ("sample_time_s", "inertia", "pitch", "rated_force", "max_speed")
 NOT_BELOW_ZERO = ("viscous", "resolution")
 REFINED = ("inertia", "viscous")
-AXIS_KEYS = ("name", "kind", *AXIS_NUMBERS, "refine")
+AXIS_KEYS = ("name", "kind", *AXIS_NUMBERS, "refine", "driven")
 CONTROLLER_NUMBERS = ("k", "kz", "kp", "kb", "offset", "limit", "velocity_filter_hz")
 CONTROLLER_KEYS = (*CONTROLLER_NUMBERS, "velocity_mean")
 
@@ -66,6 +66,7 @@ def model_from(table: Mapping[str, Any], where: str = "read model") -> AxisModel
         controller=_controller(table_in(table, "controller", where), where) if "controller" in table else None,
         refine=words(a, "refine", of_axis, ", ".join(REFINED)) or (),
         name=str(a.get("name", "axis")),
+        driven=truth(a, "driven", of_axis, True),
         **numbers,
     )
     effects = table_in(table, "effects", where, needed=False)
@@ -94,6 +95,8 @@ def check_model(model: AxisModel, where: str) -> None:
             raise BadInputError(f"{where}, [axis]: {key} is {value:g}; needs {wants} ({AXIS_NUMBERS[key][0]})")
     if not set(model.refine) <= set(REFINED):
         raise BadInputError(f"{where}, [axis]: refine is {list(model.refine)}; needs a list of {', '.join(REFINED)}")
+    if model.controller is not None and not model.driven:
+        raise BadInputError(f"{where}: [controller] beside driven = false; an axis without a drive has no controller")
     if model.controller is not None and not model.controller.limit > 0.0:
         raise BadInputError(
             f"{where}, [controller]: limit is {model.controller.limit:g}; needs the largest force, above zero"
@@ -123,6 +126,8 @@ def write_model(model: AxisModel, off: Container[str] = ()) -> str:
     for key in AXIS_NUMBERS:
         lines.append(f"{key} = {getattr(model, key)!r}")
     lines.append(f"refine = {json.dumps(list(model.refine))}")
+    if not model.driven:
+        lines.append("driven = false")
     if model.controller is not None:
         lines += ["", "[controller]"]
         lines += [f"{key} = {_toml(getattr(model.controller, key))}" for key in CONTROLLER_KEYS]

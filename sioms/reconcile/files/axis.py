@@ -141,9 +141,7 @@ def _files(data: Path) -> list[Path]:
 
 def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
     table = load_table(path)
-    for needed in ("position", "force"):
-        if needed not in columns:
-            raise BadInputError(f"read {path.name}: the column description names no {needed}; it is needed")
+    _check_needed(path, columns, model)
     found: dict[str, Array] = {}
     for quantity, spec in columns.items():
         head = table.find(str(spec.get("name")))
@@ -159,7 +157,7 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
     return Record(
         path.stem,
         found["position"],
-        found["force"],
+        found["force"] if model.driven else np.zeros_like(found["position"]),
         found.get("command"),
         found.get("force_measured"),
         None if index is None else index > 0.5,
@@ -167,6 +165,23 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
         feedforward=found.get("feedforward"),
         external=found.get("external"),
     )
+
+
+def _check_needed(path: Path, columns: Mapping[str, Any], model: AxisModel) -> None:
+    """Check that what every record must hold is described, and no force where nothing drives the axis."""
+    where = f"read {path.name}"
+    if "position" not in columns:
+        raise BadInputError(f"{where}: the column description names no position; it is needed")
+    if model.driven and "force" not in columns:
+        raise BadInputError(
+            f"{where}: the column description names no force; it is needed, unless nothing drives the axis "
+            "(driven = false in [axis] of the model)"
+        )
+    if not model.driven and (other := {"force", "force_measured", "feedforward"} & set(columns)):
+        raise BadInputError(
+            f"{where}: the column description names {', '.join(sorted(other))}, the model says driven = false; "
+            "a force on an axis without a drive is external"
+        )
 
 
 def _convert(quantity: str, raw: Array, spec: Mapping[str, Any], stated: str | None, model: AxisModel) -> Array:

@@ -25,12 +25,19 @@ FEWEST = 8
 #: An index mark passes in at most this share of the rows.
 RARE = 0.1
 NEEDED = ("position", "force")
+#: How the scale of a voltage or a current is found.
+ELECTRIC = {
+    "V": "Of a motor driven by voltage: k_t/R, and viscous then holds its back-EMF, k_t k_e/R; 1 where neither is known "
+    "(inertia and all forces are then in V).",
+    "A": "The torque or force constant, gear included; 1 where it is not known (inertia and all forces are then in A).",
+}
 #: What is not needed, in words.
 SPARE = {"velocity": "a speed", "acceleration": "an acceleration"}
 #: What may stand for a quantity that is needed.
 HINTS = {
     "position": "",
-    "force": "; what the drive was told, or where that was not recorded its measured force or current with a scale",
+    "force": "; what the drive was told, or where that was not recorded its measured force or current with a scale; "
+    "none where nothing drives the axis (driven = false in nominal.toml)",
 }
 
 
@@ -125,6 +132,8 @@ def _by_head(head: str, table: Table) -> str | None:
         return "force" if found is None else None
     if kind == "time" and found != "time":
         return None
+    if kind == "electric" and found == "velocity":
+        found = {"V": "force", "A": "force_measured"}[unit[-1]] if unit and unit != "%" else None  # v [V], not a speed
     if found == "index" and not _fits(found, table.columns[head]):
         found = "position"  # a place along z
     return found if found is not None and _fits(found, table.columns[head]) else None
@@ -206,7 +215,7 @@ def _questions(guesses: list[Guess]) -> list[str]:
         if g.unit is None and g.quantity in ("position", "command", "force", "force_measured"):
             out.append(f"in what unit is {g.head!r}, which seems to be the {g.quantity} ({g.why})?")
         elif g.unit is not None and measures(g.unit) == "electric" and g.unit != "%":
-            out.append(f"how many N or N m is one {g.unit} of {g.head!r} (scale)?")
+            out.append(f"how many N or N m is one {g.unit} of {g.head!r} (scale)? {ELECTRIC[g.unit[-1]]}")
     return out
 
 

@@ -76,6 +76,15 @@ def test_a_unit_says_more_than_a_head() -> None:
     assert quantities({"v": X}, {"v": "rpm"}) == {"v": "velocity"}
 
 
+def test_a_voltage_is_no_speed_and_its_scale_is_explained(tmp_path: Path) -> None:
+    assert quantities({"t": T, "x": X, "v [V]": U})["v [V]"] == "force"
+    assert quantities({"t": T, "x": X, "v [%]": U})["v [%]"] is None
+    rows = "\n".join(f"{t:.6g};{x:.9f};{u:.6f}" for t, x, u in zip(T, X, U, strict=True))
+    (tmp_path / "run.csv").write_text(f"t [s];theta [rad];v [V]\n{rows}\n")
+    (asked,) = [q for q in describe(tmp_path).questions if "scale" in q]
+    assert "k_t/R" in asked and "back-EMF" in asked
+
+
 def test_what_is_not_known_is_asked_and_the_draft_is_not_used_before(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", t=T, pos=X, u=U, other=np.random.default_rng(1).normal(size=2000))
     draft = describe(tmp_path)
