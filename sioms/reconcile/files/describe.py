@@ -27,8 +27,8 @@ RARE = 0.1
 NEEDED = ("position", "force")
 #: How the scale of a voltage or a current is found.
 ELECTRIC = {
-    "V": "Of a motor driven by voltage: k_t/R, and viscous then holds its back-EMF, k_t k_e/R; 1 where neither is known "
-    "(inertia and all forces are then in V).",
+    "V": "Of a motor driven by voltage: k_t/R, and viscous then holds its back-EMF, k_t k_e/R; 1 where neither is "
+    "known (inertia and all forces are then in V).",
     "A": "The torque or force constant, gear included; 1 where it is not known (inertia and all forces are then in A).",
 }
 #: What is not needed, in words.
