@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from sioms.motion.axis_step import ENDS, LATE, NOT_FINITE, ODD, WIDE, Loop, quiet_tick
+from sioms.motion.stop_step import Stopping, rest_stopped, stop_axes
 from sioms.native.language import Floats, Integers, Record, step
 from sioms.native.system import clock_ns
 from sioms.plant.binary_step import Beams, look
@@ -44,6 +45,7 @@ class SimulatedAxes(Record):
     seen: Floats
     near: Floats
     loop: Loop
+    stopping: Stopping
     motors: Motors
     steppers: Steppers
     beams: Beams
@@ -66,21 +68,18 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     that cannot be done for soon is left to the next tick. Returns what the driver has to see to, 0 for nothing.
     """
     behind = int((now_ns - s.last_ns) / s.period_ns)
-    if behind < 1 or behind * s.period_ns != now_ns - s.last_ns or now_ns - s.last_ns > s.late_ns:
+    beside_ns = now_ns - s.last_ns - behind * s.period_ns
+    if 2 * beside_ns > s.period_ns:
+        behind += 1
+        beside_ns -= s.period_ns
+    if now_ns - s.last_ns > s.late_ns:
         return NOT_READY
-    if s.still or (behind > s.stride and stands(s)):  # what was left out changes nothing
-        s.last_ns += (behind - 1) * s.period_ns
-        behind = 1
-    until_ns = clock_ns() + s.make_up_ns
-    shown_ns = shown_as_of(s.axes)
-    ticks = min(behind, s.stride)
-    found = turn_axes(s, s.last_ns + ticks * s.period_ns, ticks)
-    behind -= ticks
-    while not found and behind and (behind <= s.stride or clock_ns() < until_ns):
-        show_axes(s, s.last_ns, shown_ns, number)
-        ticks = min(behind, s.stride)
-        found = turn_axes(s, s.last_ns + ticks * s.period_ns, ticks)
-        behind -= ticks
+    if behind and not beside_ns:
+        found = make_up(s, behind, number)
+    elif behind < 2 and not s.still and (not beside_ns or 5 * abs(beside_ns) >= s.period_ns):  # off the grid
+        found = turn_axes(s, now_ns, behind, beside_ns)
+    else:
+        return NOT_READY
     if found:
         return found
     s.instants[OUTPUTS] = clock_ns()
@@ -88,8 +87,27 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     s.plant.words[ALIVE] = s.instants[OUTPUTS]
     if s.beams.n:
         s.port.words[ALIVE] = s.instants[OUTPUTS]
-    show_axes(s, s.last_ns, as_of_ns, number)
+    show_axes(s, s.last_ns + beside_ns, as_of_ns, number)
     return 0
+
+
+@step
+def make_up(s: SimulatedAxes, behind: int, number: int) -> int:
+    """Do the turns since the last, and show all but the last of them; returns what was found."""
+    if s.still or (behind > s.stride and stands(s)):  # what was left out changes nothing
+        s.last_ns += (behind - 1) * s.period_ns
+        behind = 1
+    until_ns = clock_ns() + s.make_up_ns
+    shown_ns = shown_as_of(s.axes)
+    ticks = min(behind, s.stride)
+    found = turn_axes(s, s.last_ns + ticks * s.period_ns, ticks, 0)
+    behind -= ticks
+    while not found and behind and (behind <= s.stride or clock_ns() < until_ns):
+        show_axes(s, s.last_ns, shown_ns, number)
+        ticks = min(behind, s.stride)
+        found = turn_axes(s, s.last_ns + ticks * s.period_ns, ticks, 0)
+        behind -= ticks
+    return found
 
 
 @step
@@ -104,34 +122,41 @@ def show_axes(s: SimulatedAxes, stamp_ns: int, as_of_ns: int, number: int) -> in
 
 
 @step
-def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int) -> int:
-    """Let the world go on by some ticks up to now under the last command, measure, and command anew."""
+def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int, beside_ns: int) -> int:
+    """Let the world go on by some ticks under the last command, measure, and command anew.
+
+    The world goes by whole ticks: a turn so long after one reads what would be read by then.
+    """
     while s.ahead < ticks:
         if move_axes(s):
             return NOT_READY
+    if s.stopping.braked_ns and rest_stopped(s.stopping, now_ns):
+        return ENDS
     loop = s.loop
     m = s.motors
     p = s.steppers
     for j in range(m.n):
-        loop.measured[s.motor_rows[j]] = m.encoders.reading[j]
+        loop.measured[s.motor_rows[j]] = m.encoders.reading[j] + m.velocity[j] * (beside_ns * 1e-9)
         loop.switches[s.motor_rows[j]] = m.switches[j]
     for j in range(p.n):
         i = s.stepper_rows[j]
-        loop.measured[i] = p.reading[j]
+        loop.measured[i] = p.reading[j] + p.velocity[j] * (beside_ns * 1e-9)
         loop.switches[i] = (1 if p.at_minus[j] else 0) + (2 if p.at_plus[j] else 0) + (4 if p.at_home[j] else 0)
     s.instants[INPUTS] = clock_ns()
     found = quiet_tick(loop, now_ns)
     if found & UNDONE:
         return found
-    s.ahead = 0
+    s.ahead = max(0, s.ahead - ticks)
     s.still = 0
-    s.last_ns = now_ns
+    s.last_ns = now_ns - beside_ns
     for j in range(m.n):
         s.data[2 * s.motor_rows[j]] = m.position[j]
         s.data[2 * s.motor_rows[j] + 1] = m.contact_force[j]
     for j in range(p.n):
         s.data[2 * s.stepper_rows[j]] = p.position[j]
-    s.found = found | look_at_axes(s, now_ns)
+    s.found = found
+    if not beside_ns:
+        s.found = found | look_at_axes(s, now_ns)
     return s.found
 
 
@@ -141,6 +166,14 @@ def look_at_axes(s: SimulatedAxes, now_ns: int) -> int:
     for j in range(s.beams.m):
         s.beams.now[j] = s.data[2 * j]
     return EDGE if s.beams.n and look(s.beams, now_ns) else 0
+
+
+@step
+def brake_axes(s: SimulatedAxes, now_ns: int, a: int, b: int) -> int:
+    """Begin to stop all axes, not later than a tick after the last. Returns 1 where that is for the driver."""
+    if s.found or now_ns - s.last_ns > s.late_ns:
+        return 1
+    return stop_axes(s.stopping, now_ns if s.still else min(now_ns, s.loop.last_ns + s.period_ns))
 
 
 @step

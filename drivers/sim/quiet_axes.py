@@ -13,7 +13,7 @@ from sioms.plant.stepper_step import Steppers
 from sioms.sdk.pages import Pages
 from sioms.sdk.quiet_step import Page
 
-from .axes_step import SimulatedAxes, advance_axes, rest_axes, tick_axes
+from .axes_step import SimulatedAxes, advance_axes, brake_axes, rest_axes, tick_axes
 
 if TYPE_CHECKING:
     from .axes import SimAxes
@@ -31,6 +31,7 @@ class QuietAxes:
     tick = staticmethod(tick_axes)
     slack = staticmethod(advance_axes)
     rest = staticmethod(rest_axes)
+    stop = staticmethod(brake_axes)
 
     def __init__(self, driver: SimAxes, pages: Pages, instants: NDArray[np.int64]) -> None:
         self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
@@ -39,7 +40,7 @@ class QuietAxes:
         self.record = SimulatedAxes(
             period_ns=driver._tick_ns, late_ns=driver._late_ns, make_up_ns=driver.make_up_ns, stride=driver._stride,
             ahead=0, last_ns=0, found=0, plain=0, idle=0, may_rest=0, still=0, seen=driver._seen,
-            near=driver._near, loop=driver.bank.loop,
+            near=driver._near, loop=driver.bank.loop, stopping=driver.bank.stopping,
             motors=motors.record if motors else Motors.empty(),
             steppers=steppers.record if steppers else Steppers.empty(), beams=self._beams,
             motor_rows=driver._servo_rows, stepper_rows=driver._stepper_rows,

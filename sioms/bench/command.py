@@ -21,6 +21,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     "race": ("opening", "two writers racing for one output"),
     "start": ("starting", "daemon start to ready, memory of daemon and drivers"),
     "restart": ("starting", "driver killed to its node back"),
+    "light": ("light", "100 light devices in one process on one core: start, processor, memory, stops"),
     "axes": ("axes", "axes that one core carries at 1, 2, 3 and 5 kHz, and where a tick's time goes"),
     "motion": ("motion", "idle wait against ideal end, start skew of two processes, marker to waiting axis"),
     "edge": ("motion", "edge of a light beam to a waiting client awake"),

@@ -14,7 +14,7 @@ HISTORY = 1024
 """Snapshots kept by watched devices: at 1 kHz a second."""
 SLOWER = 1e-9
 LOOK_BACK_NS = 3_000_000
-"""A snapshot that far before the act tells the speeds that must fall."""
+"""A snapshot that far before the act tells the speeds that must fall, of devices at 1 kHz."""
 
 
 class Watch:
@@ -46,7 +46,10 @@ class Watch:
             time.sleep(0.002)
 
 
-def halting_ns(watch: Watch, since_ns: int, deceleration: float | None = None, timeout_s: float = 3.0) -> int:
+def halting_ns(
+    watch: Watch, since_ns: int, deceleration: float | None = None, timeout_s: float = 3.0,
+    look_back_ns: int = LOOK_BACK_NS,
+) -> int:  # fmt: skip
     """Return the stamp of the first snapshot in which every axis was commanded slower than at ``since_ns``.
 
     Args:
@@ -55,11 +58,12 @@ def halting_ns(watch: Watch, since_ns: int, deceleration: float | None = None, t
         deceleration: known constant deceleration of all axes [m/s^2]: then the instant at which the last
             of them began to brake is returned, instead of the tick that showed it first.
         timeout_s: how long to wait for it [s].
+        look_back_ns: some periods of the tick: a snapshot that far before tells the speeds that must fall [ns].
 
     Raises:
         TimeoutError: an axis went on.
     """
-    before = watch.first(lambda s: True, since_ns - LOOK_BACK_NS, timeout_s, "a first look").commanded_velocity
+    before = watch.first(lambda s: True, since_ns - look_back_ns, timeout_s, "a first look").commanded_velocity
 
     def slower(snapshot: Any) -> bool:
         pairs = zip(snapshot.commanded_velocity, before, strict=True)

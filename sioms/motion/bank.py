@@ -80,6 +80,8 @@ class Bank(ABC):
         self._queue = CommandQueue(settings, markers, capacity, passing)
         self._arrivals = Arrivals(settings)
         self._raw, self._offset = np.zeros(n), np.zeros(n)
+        self._braked = np.zeros(n, dtype=bool)
+        """Axes whose emergency stop has been begun, and latched, by steps, and has still to be told."""
         self._written: list[Written] = []
         self._seen = False
         self._last_ns = 0
@@ -240,7 +242,8 @@ class Bank(ABC):
         """Empty the buffers and stop the fastest way there is; latched: writes are refused (EPERM) until reset()."""
         chosen = np.asarray(axes, dtype=np.int64)
         self._queue.latched_ns[chosen] = now_ns
-        fresh = chosen[(self._queue.latched[chosen] & EMERGENCY_STOP) == 0]
+        fresh = chosen[((self._queue.latched[chosen] & EMERGENCY_STOP) == 0) | self._braked[chosen]]
+        self._braked[chosen] = False
         if not fresh.size:
             return
         self._queue.latched[fresh] |= EMERGENCY_STOP

@@ -87,6 +87,9 @@ class AxisBank(Bank):
             settings, self._queue, store, self._law, self._arrivals, self._position, self._velocity, self._in_motion,
             tick_s,
         )  # fmt: skip
+        self.stopping = self._sequencer.stopping(self._braked)
+        self._braked_ns = 0
+        """When the stop of these axes began [ns]; 0: there are none."""
         self._guard = LimitGuard(self._queue, self._sequencer)
         self._homing = HomingRuns(settings, self._queue, self)
         self._motion_watch = HostWatch(settings, tick_s, self._law)
@@ -128,17 +131,18 @@ class AxisBank(Bank):
 
         A late tick stops what moves where it was last put out; a verb that comes before it must not let
         the set-points run on to now. Where late ticks are made up for, it must not let them run on past the first of
-        these.
+        these. A stop that steps have begun was at its own instant.
         """
-        if not self._seen:
-            return now_ns
+        if not self._seen or self._braked_ns:
+            return self._braked_ns or now_ns
         if now_ns - self._last_ns > self._late_ns:
             return self._last_ns
         return min(now_ns, self._last_ns + round(self._tick_s * 1e9)) if self._makes_up() else now_ns
 
     def _catch_up(self, now_ns: int) -> int:
         now_ns = self._instant(now_ns)
-        self._sequencer.advance(now_ns)
+        if not self._braked_ns:  # where a stop is over at once, what waited behind it is still to be dropped
+            self._sequencer.advance(now_ns)
         return now_ns
 
     def _idle(self, axes: Axes) -> NDArray[np.bool_]:
@@ -161,9 +165,10 @@ class AxisBank(Bank):
 
     def _halt(self, axes: Axes, now_ns: int, *, fastest: bool) -> None:
         """Brake; in force mode the controlled stop holds, the fastest one lets go until reset()."""
+        brakes, self._braked_ns = self._braked_ns > 0, 0
         in_force = axes[self._sequencer.kind[axes] == FORCE] if fastest else axes[:0]
         self._homing.cancel(axes)
-        self._sequencer.halt(axes, now_ns)
+        self._sequencer.halt(axes, now_ns, brakes=brakes)
         if in_force.size:
             self._set_limp(in_force)
 
@@ -267,6 +272,7 @@ class AxisBank(Bank):
             array is reused by the next tick.
         """
         loop, first = self.loop, not self._seen
+        self._braked_ns = 0
         last_ns = now_ns if first else self._last_ns
         self._last_ns = now_ns
         if now_ns - last_ns > self._late_ns:
@@ -311,14 +317,21 @@ class AxisBank(Bank):
             or self._law.force_ends.any or sequencer.has_work or self.keeper is not None
         ):  # fmt: skip
             return False
+        self.stopping.braked_ns = 0
         loop.any_guard, loop.next_ns, loop.last_ns = sequencer.any_guard, sequencer.store.next_ns, self._last_ns
         return True
 
     def after_quiet(self) -> None:
-        """Go on behind quiet ticks, if there were any."""
+        """Go on behind quiet ticks, if there were any, and behind a stop that steps have begun.
+
+        The ``emergency_stop`` of all axes follows at once.
+        """
         if self._last_ns != self.loop.last_ns:
             self._last_ns = self.loop.last_ns
             self._sequencer.begin_tick(self.loop.dt)
+        if self.stopping.braked_ns and self._braked.any():
+            self._braked_ns = self.stopping.braked_ns
+            self._sequencer.after_stop()
 
     def finish_tick(self, found: int) -> NDArray[np.float64]:
         """Finish a quiet tick that has found something, and return what ``tick`` would have."""

@@ -26,6 +26,7 @@ from .law import ControlLaw
 from .profile import Bounds, InfeasibleError, Plan, Planner, State, plan_force
 from .queue import CommandQueue
 from .settings import AxisSettings
+from .stop_step import Stopping
 from .store import UNCUT_NS, PlanStore
 from .types import EventKind
 
@@ -204,11 +205,35 @@ class Sequencer:
                 self._todo.pop(axis, None)
                 self._held.pop(axis, None)
 
-    def halt(self, axes: Axes, now_ns: int) -> None:
-        """Drop the commands and brake at maximum deceleration from the present state."""
+    def stopping(self, fresh: NDArray[np.bool_]) -> Stopping:
+        """Return what the steps of a stop work on; ``fresh`` is theirs to fill."""
+        store = self.store
+        return Stopping(
+            loop=self._law.loop, row=store.row, start_ns=store.start_ns, start_fraction=store.start_fraction,
+            end_ns=store.end_ns, cut_ns=store.cut_ns, duration=store.duration, final=store.final,
+            row_kind=self._row_kind, row_signals=self._row_signals, row_checked=self._row_checked,
+            row_taken=self._row_taken, stopped=self.stopped, fresh=fresh,
+            braked_ns=0, **store.segments,
+        )  # fmt: skip
+
+    def after_stop(self) -> None:
+        """Go on behind a stop that steps have begun: plans that are over are due."""
+        self.store.look_ahead()
+        self._settle_masks()
+        self.refresh(np.arange(len(self.kind)))
+
+    def halt(self, axes: Axes, now_ns: int, *, brakes: bool = False) -> None:
+        """Drop the commands and brake at maximum deceleration from the present state.
+
+        Args:
+            axes: which.
+            now_ns: when [ns].
+            brakes: steps have begun their stops at now; an axis that fell behind since goes on with its.
+        """
         waited = axes[(self.kind[axes] == HOLD) & self._queue.has_head[axes]]
         self.drop(axes)
-        moving = axes[(self.kind[axes] != HOLD) & (self.kind[axes] != STOP) | self._law.is_behind(axes)]
+        moves = (self.kind[axes] != HOLD) & (self.kind[axes] != STOP)
+        moving = axes[moves if brakes else moves | self._law.is_behind(axes)]
         if moving.size:
             self.stop(moving, now_ns, now_ns)
             self.advance(now_ns)

@@ -8,7 +8,7 @@ is carried from command to command, so that a trajectory of many pieces does not
 from __future__ import annotations
 
 import math
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,6 +47,13 @@ class PlanStore:
         self._ends = np.full((2 * n, MAX_SEGMENTS), np.inf)
         self._coefficients = np.zeros((2 * n, MAX_SEGMENTS, 6))
         self.present = np.zeros((6, n))
+
+    @property
+    def segments(self) -> dict[str, NDArray[Any]]:
+        """The arrays of segments, as the steps of a stop call them."""
+        return {
+            "segment": self._segment, "count": self._count, "ends": self._ends, "coefficients": self._coefficients
+        }  # fmt: skip
 
     def put(self, row: int, plan: Plan) -> None:
         """Write a plan into a row."""
@@ -183,6 +190,10 @@ class PlanStore:
         if not axes.size:
             self.next_ns = int(self.end_ns.min())
         return axes
+
+    def look_ahead(self) -> None:
+        """Note when the next segment ends: others have changed that."""
+        self.next_ns = int(self.end_ns.min())
 
     def ended_at(self, axes: Axes) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Return the exact instants, ns and fraction, at which the running plans end."""

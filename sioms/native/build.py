@@ -18,7 +18,11 @@ from pathlib import Path
 from . import language
 from .translate import translate
 
-OPTIONS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=default")
+OPTIONS = (
+    "-std=gnu11", "-O2", "-ffp-contract=off", "-fno-fast-math", "-fvisibility=default",
+    "-Werror=implicit-function-declaration",
+)  # fmt: skip
+"""A function without a declaration is refused by some compilers and taken for another by others."""
 DEVIN, DEVIN_SOURCE = "_devin", "sioms.tools.compiled"
 
 

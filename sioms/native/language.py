@@ -32,6 +32,7 @@ import numpy as np
 
 MODULES: tuple[str, ...] = (
     "sioms.motion.axis_step",
+    "sioms.motion.stop_step",
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
     "sioms.plant.stepper_step",

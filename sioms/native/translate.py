@@ -19,6 +19,7 @@ from .language import ARRAYS, PREFIX, Call, Context, Flags, Floats, Integers, Re
 HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <math.h>
 #include <stdint.h>
+#include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
 #include <sys/timerfd.h>

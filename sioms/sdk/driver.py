@@ -174,6 +174,13 @@ class QuietSteps(Protocol):
         device is at rest, as ``TickDriver.is_at_rest`` does, else 0.
         """
 
+    @property
+    def stop(self) -> Callable[[Any, int, int, int], int]:
+        """Step of an emergency stop: takes the record, now [ns], and twice 0; all axes begin to stop, as
+        ``Bank.emergency_stop`` would have them, which is called later for what else there is to be done. Returns 0, or
+        1 when nothing has been done because it takes more than that.
+        """
+
     def is_ready(self, watched: bool) -> bool:
         """Tell whether the next ticks may be steps, and hand the record over; ``watched``: ``rest`` is not asked."""
 

@@ -29,7 +29,7 @@ from sioms.protocol.verbs import take
 
 from .finding import find_driver, read_settings
 from .quiet import QuietRun
-from .quiet_step import Many, heed_one, run_many
+from .quiet_step import Many, begin_stop, heed_one, run_many
 from .rt import ChangeWatch, name_process, settle
 from .runtime import Runtime
 
@@ -38,7 +38,9 @@ MOST_FILES = 65536
 REQUEST = 2
 """Which of a device's descriptors is the stop-request file, see ``process.run``."""
 PAUSE_S = 50e-6
-"""After each device that has come: a process in a real-time class must not work for long without a pause."""
+"""After each device that has come, and after each few that have been served in a row: a process in a real-time class
+must not work for long without a pause."""
+IN_A_ROW = 8
 
 
 @dataclass(slots=True)
@@ -50,6 +52,7 @@ class Member:
         fds: what its runtime has been given and does not close itself.
         priority, user: of the process, by what its configuration says.
         quiet: by whom it ticks while it waits; None: by its loop.
+        owes: whether it has to look for a stop that somebody has asked for.
     """
 
     runtime: Runtime
@@ -57,6 +60,7 @@ class Member:
     priority: int
     user: str
     quiet: QuietRun | None = None
+    owes: bool = False
 
 
 class Group:
@@ -74,6 +78,9 @@ class Group:
         self._epoll.register(sock.fileno(), select.EPOLLIN)
         self._members: dict[int, Member] = {}
         self._built: deque[Member] = deque()
+        self._due: dict[int, None] = {}
+        """Who has more to do than to tick, by descriptor: one after another, the others tick in between."""
+        self._in_a_row = 0
         self._requests: ChangeWatch | None = None
         self._is_settled = False
         self._of = np.zeros(MOST_FILES, dtype=np.int64)
@@ -88,24 +95,43 @@ class Group:
             if self._built:
                 self._start(self._built.popleft())
             for fd in self._wait():
-                member = self._members.get(fd)
-                if member is not None:
-                    self._serve(fd, member)
+                if fd in self._members:
+                    self._put(fd)
                 elif self._requests is not None and fd == self._requests.fd:
                     self._heed_requests()
                 elif self._sock is not None and fd == self._sock.fileno():
                     self._take(self._sock)
+            self._serve_next()
 
     def _wait(self) -> list[int]:
         """Return the descriptors that are ready; those of members who have more to do are."""
         pauses = {fd: pause for fd, m in self._members.items() if (pause := m.runtime.pause_s) is not None}
-        timeout_s = 0.0 if self._built else min(pauses.values(), default=None)
+        timeout_s = 0.0 if self._built or self._due else min(pauses.values(), default=None)
         if library is None:
             found = [fd for fd, _ in self._epoll.poll(timeout_s)]
         else:
             self._many.timeout_ms = -1 if timeout_s is None else math.ceil(timeout_s * 1e3)
             found = self._ready[: run_many(self._many)].tolist()
         return found + [fd for fd in pauses if fd not in found]
+
+    def _put(self, fd: int) -> None:
+        """Have a member served soon; until then it ticks on, unless the tick itself is what there is to be served."""
+        quiet = self._members[fd].quiet
+        if quiet is not None and (quiet.record.left or quiet.record.slackens):
+            self._of[fd] = 0
+        self._due.setdefault(fd)
+
+    def _serve_next(self) -> None:
+        """Serve the member whose turn it is."""
+        if not self._due:
+            return
+        fd = next(iter(self._due))
+        del self._due[fd]
+        self._serve(fd, self._members[fd])
+        self._in_a_row += 1
+        if self._in_a_row >= IN_A_ROW:
+            self._in_a_row = 0
+            time.sleep(PAUSE_S)
 
     # --- devices ---------------------------------------------------------------------------------
 
@@ -165,8 +191,13 @@ class Group:
         settle(member.priority, member.user, log)
 
     def _serve(self, fd: int, member: Member) -> None:
+        runtime, ticked = member.runtime, member.quiet is not None
         ready = self._take_back(fd, member)
-        self._guarded(member, lambda: member.runtime.serve(ready + member.runtime.ready_but(ready)))
+        owes, member.owes = member.owes, False
+        if owes:
+            self._guarded(member, runtime.heed_requests)
+        known = [*ready, *runtime.timers] if ticked else ready  # steps go on with the timers
+        self._guarded(member, lambda: runtime.serve(ready + runtime.ready_but(known)))
         self._go_on(fd, member)
 
     def _take_back(self, fd: int, member: Member) -> list[int]:
@@ -183,6 +214,7 @@ class Group:
         self._guarded(member, lambda: self._lend(fd, member))
         if not member.runtime.running:
             del self._members[fd]
+            self._due.pop(fd, None)
             self._epoll.unregister(fd)
             member.runtime.release()
             _close(member.fds)
@@ -203,15 +235,21 @@ class Group:
             member.runtime.running = False
 
     def _heed_requests(self) -> None:
-        """Somebody asks for a stop: all devices brake, then whatever else there is to do."""
+        """Somebody asks for a stop: all devices brake at once, by steps where these can, and tell of it one by one."""
         if self._requests is not None:
             self._requests.drain()
-        for fd, member in list(self._members.items()):
-            ready = self._take_back(fd, member)
-            self._guarded(member, member.runtime.heed_requests)
-            if ready:
-                self._guarded(member, lambda ready=ready, member=member: member.runtime.serve(ready))  # type: ignore[misc]
-            self._go_on(fd, member)
+        for member in self._members.values():
+            member.owes = True
+        for fd, member in list(self._members.items())[:1]:
+            self._serve(fd, member)  # which puts the stop into the latch
+        now_ns = time.monotonic_ns()
+        owing = {fd: self._brakes(member, now_ns) for fd, member in self._members.items() if member.owes}
+        braking = [fd for fd, brakes in owing.items() if brakes]
+        self._due = dict.fromkeys([fd for fd, brakes in owing.items() if not brakes] + [*self._due] + braking)
+
+    def _brakes(self, member: Member, now_ns: int) -> bool:
+        """Have a member begin its stop by steps; return whether it has."""
+        return member.quiet is not None and begin_stop(member.quiet.record, now_ns) == 0
 
 
 def _close(fds: list[int]) -> None:

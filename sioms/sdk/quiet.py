@@ -59,18 +59,24 @@ class QuietRun:
             poll=poll, timer=timer, line_timer=line_timer, ready=self._ready, latch=latch, stopped=0, resets=0,
             orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
             announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
-            tick=steps.tick, slack=steps.slack, rest=steps.rest, instants=instants, scheduled_ns=0, began_ns=0,
-            number=0, waiting=0, done=0, expired=0, slackens=0, ring=statistics.ring.reshape(-1), ticks=0, skipped=0,
-            longest_ns=0,
+            tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, early_ns=0, heeded_ns=0,
+            instants=instants, scheduled_ns=0, ticked_ns=0, began_ns=0, number=0, waiting=0, left=0, done=0, expired=0,
+            slackens=0, ring=statistics.ring.reshape(-1), ticks=0, skipped=0, longest_ns=0,
         )  # fmt: skip
 
-    def lend(self, scheduled_ns: int, number: int, watched: bool, announced: int = 0, worked_ns: int = 0) -> bool:
+    def lend(
+        self, scheduled_ns: int, number: int, watched: bool, announced: int = 0, worked_ns: int = 0,
+        early_ns: int = 0, ticked_ns: int = 0, looked_ns: int = 0,
+    ) -> bool:  # fmt: skip
         """Let steps tick from now on, until ``take_back``; return False when the loop has to.
 
         Args:
             scheduled_ns, number: of the last tick.
             watched: whether somebody looks at the device.
             announced, worked_ns: whether the slack of the next tick is done, and how long that took [ns].
+            early_ns: when an early tick is due, 0: none is [ns].
+            ticked_ns: when the last tick was, early ones too [ns].
+            looked_ns: all that was asked for before has been heeded [ns].
         """
         record, statistics, idling = self.record, self._statistics, self._idling
         until_ns = self._waits.until_ns()
@@ -81,9 +87,10 @@ class QuietRun:
         record.scheduled_ns, record.number = scheduled_ns, number
         record.watched, record.periods, record.restless_ns = watched, idling.periods, idling.restless_ns
         record.announced, record.worked_ns = announced, worked_ns
+        record.early_ns, record.ticked_ns, record.began_ns, record.heeded_ns = early_ns, ticked_ns, looked_ns, 0
         record.ticks, record.longest_ns = statistics.ticks, statistics.longest_ns
         record.skipped = statistics.skipped
-        record.waiting = record.done = record.expired = record.slackens = record.told = 0
+        record.waiting = record.left = record.done = record.expired = record.slackens = record.told = 0
         return True
 
     def run(self) -> None:

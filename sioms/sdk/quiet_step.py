@@ -63,16 +63,19 @@ class Quiet(Record):
     """A driver process between two events.
 
     ``poll``, ``timer``, ``line_timer`` and ``ready``: descriptors. ``latch`` page, and what of it has been seen. After
-    ``until_ns`` a lease or a wait may end. ``device`` has the steps ``tick``, ``slack`` and ``rest``.
+    ``until_ns`` a lease or a wait may end. ``device`` has the steps ``tick``, ``slack``, ``rest`` and ``stop``.
 
     A tick comes every ``period_ns`` times ``periods``. ``lead_ns`` before it, where that is not 0 and periods are 1, is
     its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
     else it is idle when it has been at rest for ``rest_ns`` since ``restless_ns``, and ``told`` is RESTED or STIRS.
 
-    ``scheduled_ns``, ``began_ns`` and ``number`` of the last tick. Since the loop has waited: ``done`` ticks;
-    ``waiting``, how many descriptors are ``ready`` for the loop; ``expired``: the timer has been read, and the tick is
-    the loop's; ``slackens``: the loop has to do the slack of the last tick. ``ring`` of
-    the statistics.
+    ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: a stop in the latch
+    has been begun by steps, and the loop has yet to see to it; what was asked for before this instant has been heeded.
+
+    ``scheduled_ns``, ``began_ns`` and ``number`` of the last tick, ``ticked_ns`` also of an early one. Since the loop
+    has waited: ``done`` ticks; ``waiting``, how many descriptors are ``ready`` for the loop, ``left``: a timer is one
+    of them; ``expired``: the timer has been read, and the tick is the loop's; ``slackens``: the loop has to do the
+    slack of the last tick. ``ring`` of the statistics.
     """
 
     poll: int
@@ -98,11 +101,16 @@ class Quiet(Record):
     tick: Call
     slack: Call
     rest: Call
+    stop: Call
+    early_ns: int
+    heeded_ns: int
     instants: Integers
     scheduled_ns: int
+    ticked_ns: int
     began_ns: int
     number: int
     waiting: int
+    left: int
     done: int
     expired: int
     slackens: int
@@ -161,17 +169,61 @@ def record(q: Quiet, ended_ns: int, slack_ns: int) -> int:
 
 
 @step
+def begin_stop(q: Quiet, now_ns: int) -> int:
+    """Begin to stop as the latch wants it, with a tick soon. Returns 1, and nothing is done, where the loop has to."""
+    if not q.latch[STOPPED] or q.latch[STOPPED] == q.stopped or q.latch[RESETS] != q.resets:
+        return 1
+    if q.stop(q.device, now_ns, 0, 0):
+        return 1
+    q.stopped = q.latch[STOPPED]
+    q.heeded_ns = q.began_ns
+    if q.lead_ns and q.periods == 1 and not q.announced:
+        early_ns = max(now_ns, q.ticked_ns + int(q.period_ns / 4))
+        if early_ns <= q.scheduled_ns + int(q.period_ns / 2):
+            q.early_ns = early_ns
+            set_timer(q.line_timer, early_ns)
+    return 0
+
+
+@step
+def may_tick(q: Quiet, now_ns: int) -> int:
+    """Return whether there is nothing that the loop has to see to before a tick.
+
+    A stop is begun; orders that come behind it have time.
+    """
+    if q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns):
+        return 0
+    if q.latch[RESETS] != q.resets or (q.latch[ORDERS] != q.orders and not q.heeded_ns):
+        return 0
+    return now_ns - q.latch[DAEMON_ALIVE] <= q.daemon_lease_ns and now_ns < q.until_ns
+
+
+@step
+def early_tick(q: Quiet) -> int:
+    """Do a tick off the grid, after a stop; return what has become of what announced it."""
+    now_ns = clock_ns()
+    if not may_tick(q, now_ns) or q.tick(q.device, now_ns, q.heeded_ns if q.heeded_ns else now_ns, q.number + 1):
+        return LEFT
+    q.early_ns = 0
+    q.began_ns = now_ns
+    q.ticked_ns = now_ns
+    q.number += 1
+    q.done += 1
+    return HEARD if q.heeded_ns else DONE
+
+
+@step
 def one_tick(q: Quiet) -> int:
     """Do a tick; return what has become of what announced it."""
     began_ns = clock_ns()
-    if q.latch[STOPPED] != q.stopped or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders:
-        return LEFT
-    if began_ns - q.latch[DAEMON_ALIVE] > q.daemon_lease_ns or began_ns >= q.until_ns:
+    if not may_tick(q, began_ns):
         return LEFT
     count = q.announced if q.announced else q.expired
     scheduled_ns = q.scheduled_ns + count * q.period_ns * q.periods
-    if q.tick(q.device, scheduled_ns, began_ns, q.number + 1):
+    if q.tick(q.device, scheduled_ns, q.heeded_ns if q.heeded_ns else began_ns, q.number + 1):
         return LEFT
+    q.early_ns = 0
+    q.ticked_ns = scheduled_ns
     q.expired = 0
     q.announced = 0
     q.skipped += (count - 1) * q.periods
@@ -186,7 +238,7 @@ def one_tick(q: Quiet) -> int:
     record(q, ended_ns, q.worked_ns)
     if not q.watched and not q.slackens:
         look_at_rest(q, ended_ns)
-    return HEARD if q.slackens or q.told else DONE
+    return HEARD if q.slackens or q.told or q.heeded_ns else DONE
 
 
 @step
@@ -223,28 +275,41 @@ def heed_timer(q: Quiet, fd: int) -> int:
         if q.expired == 0:
             return DONE
         return announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
-    if fd == q.line_timer and q.announced:
-        return one_tick(q) if expirations(q.line_timer) else DONE
+    if fd == q.line_timer and (q.announced or q.early_ns):
+        if not expirations(q.line_timer):
+            return DONE
+        return one_tick(q) if q.announced else early_tick(q)
     return LEFT
 
 
 @step
 def heed(q: Quiet, count: int) -> int:
-    """Do what some descriptors that are ready ask for, as far as it is ticks; return whether the loop has to go on."""
-    q.waiting = count
-    if count != 1:
-        return 1
-    found = heed_timer(q, q.ready[0])
-    q.waiting = 1 if found == LEFT else 0
-    return found
+    """Do what some descriptors that are ready ask for, as far as it is ticks; return whether the loop has to go on.
+
+    Both timers are ready when a tick was missed.
+    """
+    left = 0
+    heard = 0
+    for i in range(count):
+        found = LEFT if heard else heed_timer(q, q.ready[i])
+        if found == LEFT and not heard and (q.ready[i] == q.timer or q.ready[i] == q.line_timer):
+            q.left = 1
+        if found == LEFT:
+            q.ready[left] = q.ready[i]
+            left += 1
+        elif found == HEARD:
+            heard = 1
+    q.waiting = left
+    return left or heard
 
 
 @step
 def run(q: Quiet) -> int:
     """Wait and tick until the loop has to go on."""
-    while not heed(q, wait_for(q.poll, q.ready, -1)):
-        pass
-    return q.waiting
+    while True:
+        count = wait_for(q.poll, q.ready, -1)
+        if not count or heed(q, count):  # none are after a signal
+            return q.waiting
 
 
 class Many(Record):

@@ -115,6 +115,8 @@ class Runtime:
         self._moved_ns = 0
         self._is_ticking = False
         self._ticked_ns = 0
+        self._brakes = False
+        """Whether steps have begun the stop that is being heeded."""
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
@@ -319,6 +321,11 @@ class Runtime:
         """Descriptor that is readable when there is something to serve."""
         return self._epoll.fileno()
 
+    @property
+    def timers(self) -> tuple[int, int]:
+        """Descriptors of the timers of ticks."""
+        return self._timer.fd, self._line_timer.fd
+
     def ready_but(self, known: Sequence[int]) -> list[int]:
         """Return the descriptors that are ready, without those that are known to be."""
         return [fd for fd, _ in self._epoll.poll(0) if fd not in known]
@@ -345,28 +352,36 @@ class Runtime:
 
     def lend(self) -> QuietRun | None:
         """Let steps tick while the process waits; return None when they may not, or there are none."""
-        is_early = self._line_due_ns is not None and not self._announced
-        if self._quiet is None or is_early or self._ending_ns or self._daemon_late or self.pause_s is not None:
+        early_ns = 0 if self._announced else self._line_due_ns or 0
+        if self._quiet is None or self._ending_ns or self._daemon_late or self.pause_s is not None:
             return None
         watched = bool(self.clients.handles) or self._is_used
-        lent = self._quiet.lend(self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns)
+        lent = self._quiet.lend(
+            self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns, early_ns, self._ticked_ns,
+            self.looked_ns,
+        )  # fmt: skip
         return self._quiet if lent else None
 
     def take_back(self, quiet: QuietRun) -> list[int]:
         """Go on after ``lend``; return the descriptors that are ready."""
         ready = quiet.take_back()
         self._resume(quiet.record)
+        if quiet.record.heeded_ns:
+            self.heed_requests()
+            self._brakes = False
         return ready
 
     def _resume(self, quiet: Quiet) -> None:
         """Go on behind ticks that have been done by steps."""
         self._expired = quiet.expired
         self._announced, self._slack_ns = quiet.announced, quiet.worked_ns
-        self._line_due_ns = quiet.scheduled_ns + quiet.announced * self.period_ns if quiet.announced else None
+        due_ns = quiet.scheduled_ns + quiet.announced * self.period_ns if quiet.announced else quiet.early_ns
+        self._line_due_ns = due_ns or None
+        self._brakes = quiet.heeded_ns > 0
         if not quiet.done:
             return
-        self.tick, self.looked_ns = quiet.number, quiet.began_ns
-        self._scheduled_ns = self._ticked_ns = quiet.scheduled_ns
+        self.tick, self.looked_ns = quiet.number, quiet.heeded_ns or quiet.began_ns
+        self._scheduled_ns, self._ticked_ns = quiet.scheduled_ns, quiet.ticked_ns
         if quiet.slackens and isinstance(self.engine, TickEngine):
             self.engine.slack(time.monotonic_ns(), self._scheduled_ns + self.period_ns)
         if quiet.told == STIRS:
@@ -382,6 +397,8 @@ class Runtime:
         the least that it gets.
         """
         if not self._lead_ns or self._is_ticking or self._announced:  # the next one of frequent ticks comes as soon
+            return
+        if self._brakes:  # by steps, which have seen to that
             return
         next_ns = self._scheduled_ns + self.period_ns
         early_ns = max(time.monotonic_ns(), self._ticked_ns + self.period_ns // 4)

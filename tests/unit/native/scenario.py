@@ -5,6 +5,7 @@ import hashlib
 import numpy as np
 
 from sioms.motion import AxisBank, AxisKind, AxisSettings, CommandError, Homing
+from sioms.motion.stop_step import rest_stopped, stop_axes
 from sioms.native import language
 from sioms.plant.effects import build_effects
 from sioms.plant.motor import MotorBank
@@ -53,7 +54,7 @@ def main():
     coils = [Stepper(0.1, 1e-3, hold_force=5.0, coulomb=0.2), Stepper(0.02, 2e-3, hold_force=1.0, encoder_step=1e-5)]
     rotors = [StepperBank(coils, 1e-3) for _ in plants]
     banks = [AxisBank(settings, tick_s=1e-3, markers=NoMarkers()) for _ in plants]
-    now, digest, refused = 1_000_000_000, hashlib.sha256(), 0
+    now, digest, refused, braked = 1_000_000_000, hashlib.sha256(), 0, 0
     reading, switches = np.zeros(5), np.zeros(5, dtype=np.int64)
     for tick in range(6000):
         now += 1_000_000 if rng.random() < 0.98 else int(rng.integers(200_000, 3_000_000))
@@ -74,10 +75,20 @@ def main():
                     bank.append(record, range(5), now, replace=bool(tick % 2))
                 except CommandError:
                     refused += 1
+        if tick % 50 == 24:
+            for bank in banks:
+                bank.plan_ahead()
+                if bank.is_quiet() and stop_axes(bank.stopping, now + 300_000) == 0:
+                    rest_stopped(bank.stopping, now + 600_000)
+                    bank.after_quiet()
+                    braked += 1
+                bank.emergency_stop(range(5), now + 700_000)
+                bank.reset(range(5))
         if tick % 500 == 499:
             for bank in banks:
                 (bank.stop if tick % 1000 == 999 else bank.emergency_stop)([tick // 500 % 5], now)
                 bank.reset(range(5))
+    assert braked > 50, "most stops are begun by steps"
     kinds = sorted({event.kind.name for bank in banks for event in bank.take_events()})
     print("compiled" if language.library else "python", digest.hexdigest(), refused, *kinds)
 

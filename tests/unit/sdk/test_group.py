@@ -16,7 +16,7 @@ class Runtime:
     def __init__(self, fails_in=""):
         self.poll_fd, self._fails_in = os.eventfd(1, os.EFD_NONBLOCK), fails_in
         self.running, self.pause_s, self.did = True, None, []
-        self.record = SimpleNamespace(address=0)
+        self.record, self.timers = SimpleNamespace(address=0, left=0, slackens=0), ()
 
     def _do(self, what):
         self.did.append(what)
@@ -54,6 +54,7 @@ class Runtime:
 @pytest.fixture
 def group(monkeypatch):
     monkeypatch.setattr(Group, "_settle", lambda self, member: None)
+    monkeypatch.setattr("sioms.sdk.group.begin_stop", lambda record, now_ns: 1)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         yield Group(ours)
@@ -73,6 +74,8 @@ def test_what_a_device_raises_ends_it_alone(group, where):
         if member.runtime.running:
             group._serve(member.runtime.poll_fd, member)
     group._heed_requests()
+    while group._due:
+        group._serve_next()
     assert bad.runtime.did[-2:] == [f"stopped: {where}", "released"], "stopped first, and once"
     assert bad.runtime.did.count("released") == 1 and not bad.runtime.running
     assert good.runtime.did == [

@@ -28,6 +28,7 @@ from sioms.sdk.quiet_step import (
     Many,
     Page,
     Quiet,
+    begin_stop,
     heed,
     heed_one,
     one_tick,
@@ -52,7 +53,7 @@ class Device:
     """A driver whose steps write down that they were called, and its process between two events."""
 
     def __init__(self, lead_ns=0, **fields):
-        self.ticks, self.slacks, self.answer, self.slackens, self.rests = [], 0, 0, 0, 0
+        self.ticks, self.slacks, self.answer, self.slackens, self.rests, self.stops = [], 0, 0, 0, 0, 1
         self.timer, self.other = os.eventfd(0, os.EFD_NONBLOCK), os.eventfd(0, os.EFD_NONBLOCK)
         self.line = TimerFd()
         self.poll = select.epoll()
@@ -67,9 +68,15 @@ class Device:
             "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns, "announced": 0,
             "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
             "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
+            "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0,
             "done": 0, "expired": 1, "slackens": 0, "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
         }  # fmt: skip
-        for name, function in (("tick", self._tick), ("slack", self._slack), ("rest", self._rest)):
+        for name, function in (
+            ("tick", self._tick),
+            ("slack", self._slack),
+            ("rest", self._rest),
+            ("stop", self._stop),
+        ):
             given[name] = function if library is None else Function(function)
         self.quiet = Quiet(**{**given, **fields})
 
@@ -83,6 +90,9 @@ class Device:
 
     def _rest(self, *_):
         return self.rests
+
+    def _stop(self, *_):
+        return self.stops
 
     def close(self):
         for fd in (self.timer, self.other):
@@ -167,9 +177,57 @@ def test_ticks_go_on_until_something_else_is_ready(make):
     assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
     os.eventfd_write(device.timer, 1)
     os.eventfd_write(device.other, 1)
+    assert run(device.quiet) == 1, "the other is the loop's"
+    assert device.ready[0] == device.other and not device.quiet.left
+    assert len(device.ticks) == 2 and not select.select([device.timer], [], [], 0)[0]
+    device.answer = 1
+    os.eventfd_write(device.timer, 1)
     assert run(device.quiet) == 2, "both are the loop's"
-    assert set(device.ready[:2].tolist()) == {device.timer, device.other}
-    assert len(device.ticks) == 1 and os.eventfd_read(device.timer) == 1
+    assert device.quiet.left and device.quiet.expired == 1
+
+
+def test_a_missed_tick_makes_both_timers_ready_and_is_made_up_for(make):
+    begin_ns = time.monotonic_ns() - 10 * PERIOD_NS
+    device = make(lead_ns=200_000, expired=0, scheduled_ns=begin_ns, announced=1)
+    os.eventfd_write(device.timer, 2)
+    quiet_step.set_timer(device.line.fd, begin_ns + PERIOD_NS)
+    select.select([device.line.fd], [], [], 10.0)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
+    if device.quiet.announced:  # the slack of the later ones came after the tick
+        select.select([device.line.fd], [], [], 10.0)
+        assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
+    assert device.ticks[-1][0] == begin_ns + 3 * PERIOD_NS and device.quiet.scheduled_ns == begin_ns + 3 * PERIOD_NS
+
+
+def test_a_stop_is_begun_by_steps_and_told_to_the_loop(make):
+    device = make(began_ns=77)
+    device.latch[STOPPED], device.latch[ORDERS] = 5, 1
+    assert one_tick(device.quiet) == LEFT and not device.ticks, "the device has refused"
+    device.stops = 0
+    assert one_tick(device.quiet) == HEARD and len(device.ticks) == 1
+    assert (device.quiet.stopped, device.quiet.heeded_ns) == (5, 77)
+    device.quiet.expired = 1
+    assert one_tick(device.quiet) == HEARD, "it ticks on until the loop has heard of it"
+    device.quiet.expired = 1
+    device.latch[STOPPED], device.latch[RESETS] = 0, 1
+    assert one_tick(device.quiet) == LEFT, "but not behind a reset"
+
+
+def test_a_stop_has_a_tick_soon_but_not_sooner_than_a_quarter_of_a_period(make):
+    period_ns, last_ns = 1_000_000_000, time.monotonic_ns()
+    device = make(lead_ns=1, expired=0, period_ns=period_ns, scheduled_ns=last_ns, ticked_ns=last_ns, began_ns=77)
+    device.stops, device.latch[STOPPED] = 0, 5
+    assert begin_stop(device.quiet, last_ns + 1000) == 0
+    assert device.quiet.early_ns == last_ns + period_ns // 4
+    device.quiet.stopped = device.quiet.early_ns = 0
+    assert begin_stop(device.quiet, last_ns + 6 * period_ns // 10) == 0
+    assert not device.quiet.early_ns, "the next one comes as soon"
+    device.quiet.early_ns = 1
+    quiet_step.set_timer(device.line.fd, 1)
+    select.select([device.line.fd], [], [], 10.0)
+    device.ready[0] = device.line.fd
+    assert heed(device.quiet, 1) and not device.quiet.waiting
+    assert len(device.ticks) == 1 and device.quiet.scheduled_ns == last_ns and device.quiet.ticked_ns > last_ns
 
 
 def test_a_slack_before_the_tick_announces_it(make):
@@ -256,7 +314,8 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
     """Return what ticks by steps for a process whose parts are as told."""
     record = Device()
     steps = SimpleNamespace(
-        tick=record.quiet.tick, slack=record.quiet.slack, rest=record.quiet.rest, record=Page.empty(),
+        tick=record.quiet.tick, slack=record.quiet.slack, rest=record.quiet.rest, stop=record.quiet.stop,
+        record=Page.empty(),
         is_ready=lambda watched: is_ready, resume=lambda: None,
     )  # fmt: skip
     statistics = SimpleNamespace(ring=record.ring.reshape(7, RING), ticks=0, longest_ns=0, skipped=0)
