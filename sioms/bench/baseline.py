@@ -49,6 +49,16 @@ class RoundTrip:
         self._sock.close()
         self._process.wait()
 
+    @property
+    def pid(self) -> int:
+        """The process that answers."""
+        return self._process.pid
+
+    def once(self, size: int) -> None:
+        """Do one round trip of a packet of a size."""
+        self._sock.send(bytes(size))
+        self._sock.recv(65536)
+
     def samples(self, count: int, size: int = 32) -> list[int]:
         """Return the durations of round trips of packets of a size [ns]."""
         sock, packet, clock = self._sock, bytes(size), time.perf_counter_ns

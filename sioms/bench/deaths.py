@@ -7,6 +7,7 @@ import os
 import signal
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 from sioms.check.daemon import Daemon, wait_for
@@ -14,7 +15,7 @@ from sioms.client.command import command
 
 from .figures import Bar, Report
 from .options import Options
-from .watching import HISTORY, Watch, halting_ns
+from .watching import HISTORY, Counted, Watch, halting_ns
 from .workcells import axes, workcell
 
 SPEED = 0.05
@@ -56,7 +57,7 @@ def _velocities(node: Any) -> tuple[float, ...]:
 def bench_client(options: Options, report: Report) -> None:
     """A client with four moving axes is killed; another hangs and its lease runs out."""
     with Daemon(workcell([DEVICE])) as daemon, daemon.cell() as cell, cell.open("mod0.readonly") as node:
-        halts, frees = [], []
+        halts, frees, counted = [], [], Counted()
         trials = options.kills(20, 1000)
         for trial in range(trials):
             victim = daemon.fork(cruise(daemon, "mod0"))
@@ -65,10 +66,10 @@ def bench_client(options: Options, report: Report) -> None:
             begin = daemon.kill(victim)
             with cell.open("mod0", "rw", 5.0):
                 frees.append(time.monotonic_ns() - begin)
-            halts.append(halting_ns(watch, begin) - begin)
+            halts.append(counted.look(partial(halting_ns, watch, begin)) - begin)
             daemon.reap(victim)
             report.progress(f"client killed: {trial} of {trials}")
-        report.samples("client SIGKILL to its 4 axes halting", halts, "ms", bars=[BAR], notes="none missed")
+        report.samples("client SIGKILL to its 4 axes halting", halts, "ms", bars=[BAR])
         report.samples("client SIGKILL to its node open again", frees, "ms", bars=[Bar("max", 50.0)])
         hangs = []
         trials = options.slow(5, 100)
@@ -77,10 +78,11 @@ def bench_client(options: Options, report: Report) -> None:
             wait_cruising(node)
             watch = Watch(node)
             begin = daemon.kill(victim, signal.SIGSTOP)
-            hangs.append(halting_ns(watch, begin) - begin)
+            hangs.append(counted.look(partial(halting_ns, watch, begin)) - begin)
             daemon.kill(victim)
             daemon.reap(victim)
             report.progress(f"client hung: {trial} of {trials}")
+        counted.tell(report, "halts")
         bars = [Bar("max", LEASE_S * 1e3 + 20.0)]
         report.samples(f"client SIGSTOP, lease {LEASE_S * 1e3:g} ms, to its axes halting", hangs, "ms", bars=bars)
 
@@ -89,21 +91,23 @@ def bench_daemon(options: Options, report: Report) -> None:
     """The daemon is killed, or hangs, while the axes of four driver processes move."""
     kills: list[int] = []
     hangs: list[int] = []
+    counted = Counted()
     for how, trials, found in (
         (signal.SIGKILL, options.kills(8, 1000), kills),
         (signal.SIGSTOP, options.slow(4, 100), hangs),
     ):
         while len(found) < trials:
-            found += _daemon_trial(how)
+            found += _daemon_trial(how, counted)
             report.progress(f"daemon {how.name}: {len(found)} of {trials}")
     if kills:
         report.samples("daemon SIGKILL to the axes of each driver halting", kills, "ms", bars=[BAR])
     if hangs:
         report.samples("daemon SIGSTOP, lease 500 ms, to the axes of each driver halting", hangs, "ms",
                        bars=[Bar("max", 520.0)])  # fmt: skip
+    counted.tell(report, "halts")
 
 
-def _daemon_trial(how: signal.Signals) -> list[int]:
+def _daemon_trial(how: signal.Signals, counted: Counted) -> list[int]:
     """Kill a fresh daemon whose devices move; return how long each of them took to halt [ns]."""
     devices = [axes(f"mod{i}", history=HISTORY, limits=False) for i in range(DRIVERS)]
     with Daemon(workcell(devices, daemon_lease_s=0.5)) as daemon:
@@ -117,7 +121,7 @@ def _daemon_trial(how: signal.Signals) -> list[int]:
         watches = [Watch(node) for node in nodes]
         begin = time.monotonic_ns()
         os.kill(daemon.pid, how)
-        found = [halting_ns(watch, begin) - begin for watch in watches]
+        found = [counted.look(partial(halting_ns, watch, begin)) - begin for watch in watches]
         if how is signal.SIGSTOP:
             os.kill(daemon.pid, signal.SIGKILL)
         return found

@@ -46,7 +46,7 @@ def bench_start(options: Options, report: Report) -> None:
         starts,
         "ms",
         baseline=base,
-        bars=[Bar("p50", 300), Bar("p50", 100)],
+        bars=[Bar("ratio", 15.0)],
     )
     for who, size in sizes.items():
         bar = Bar("value", 25 * 1024) if who == "daemon" else Bar("value", 12 * 1024)

@@ -7,8 +7,9 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from sioms.check.daemon import CpuTimes, Daemon
 from sioms.client.command import command
@@ -17,7 +18,7 @@ from .baseline import interpreter_ns, run_ns
 from .deaths import SPEED, wait_cruising
 from .figures import Bar, Report
 from .options import Options
-from .watching import HISTORY, Watch, halting_ns, standing_ns
+from .watching import HISTORY, Counted, Watch, halting_ns, slowing_ns, standing_ns
 from .workcells import axes, workcell
 
 MODULES = 4
@@ -39,35 +40,44 @@ def bench_stop(options: Options, report: Report) -> None:
         daemon.fork(lambda: _read_for_ever(daemon))
         cpu = CpuTimes({"daemon": daemon.pid, **daemon.device_pids()})
         count = options.kills(20, 1000)
-        acted, rested, calls = _trials(count, cell, nodes, report, lambda: cell.emergency_stop(why="bench"))
+        trials = _trials(count, cell, nodes, report, lambda: cell.emergency_stop(why="bench"))
+        acted, slower, rested, calls, _ = trials
         report.samples("emergency stop, call returns", calls, "ms")
-        bars = [Bar("max", 2 * TICK_MS), Bar("p99", 2 * TICK_MS)]
-        report.samples("emergency stop to the last of 4 drivers braking", acted, "ms", bars=bars)
+        bars = [Bar("p50", 1.2), Bar("p99", 2 * TICK_MS), Bar("max", 2 * TICK_MS)]
+        report.samples("emergency stop to the tick in which the last of 4 drivers brakes", acted, "ms", bars=bars)
+        report.samples("emergency stop to the last axis measured a hundredth slower", slower, "ms")
+        trials.counted.tell(report, "stops")
         bars = [Bar("p50", 5.0), Bar("p99", 10.0)]
         report.samples("emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares())
         _shell(options, report, daemon, cell, nodes)
 
 
-def _trials(
-    count: int, cell: Any, nodes: list[Any], report: Report, stop: Callable[[], object]
-) -> tuple[list[int], list[int], list[int]]:
-    """Stop moving axes again and again.
-
-    Returns:
-        When all decelerate, when all stand, and how long the call takes [ns].
+class Trials(NamedTuple):
+    """Stops of moving axes [ns]: when the first tick is in which the last of them is commanded slower, when that is
+    measured, when all stand, and how long the call takes.
     """
-    acted, rested, calls = [], [], []
+
+    acted: list[int]
+    slower: list[int]
+    rested: list[int]
+    calls: list[int]
+    counted: Counted
+
+
+def _trials(count: int, cell: Any, nodes: list[Any], report: Report, stop: Callable[[], object]) -> Trials:
+    """Stop moving axes again and again; the stamp of a tick is not interpolated to when braking began."""
+    acted, slower, rested, calls, counted = trials = Trials([], [], [], [], Counted())
     for trial in range(count):
         _fill(nodes)
         watches = [Watch(node) for node in nodes]
         begin = time.monotonic_ns()
         stop()
         calls.append(time.monotonic_ns() - begin)
-        acted.append(max(halting_ns(watch, begin, DECELERATION) for watch in watches) - begin)
-        rested.append(max(standing_ns(watch, begin) for watch in watches) - begin)
+        for samples, look in ((acted, halting_ns), (slower, slowing_ns), (rested, standing_ns)):
+            samples.append(max(counted.look(partial(look, watch, begin)) for watch in watches) - begin)
         cell.reset()
         report.progress(f"stop: {trial} of {count}")
-    return acted, rested, calls
+    return trials
 
 
 def _fill(nodes: list[Any]) -> None:
@@ -108,14 +118,18 @@ def _shell(options: Options, report: Report, daemon: Daemon, cell: Any, nodes: l
     acted: list[int] = []
     rested: list[int] = []
     calls: list[int] = []
+    counted = Counted()
     for _ in range(options.slow(10, 100)):
         bare.append(interpreter_ns())
         found = _trials(1, cell, nodes, report, lambda: run_ns([str(tool), "-e"], environment))
-        for samples, more in zip((acted, rested, calls), found, strict=True):
-            samples += more
+        acted += found.acted
+        rested += found.rested
+        calls += found.calls
+        counted.lost += found.counted.lost
     base = report.samples("bare interpreter, start to exit", bare, "ms")
     report.samples(
         "sdev -e from start to the last driver braking", acted, "ms", baseline=base, bars=[Bar("ratio", 2.0)]
     )
     report.samples("sdev -e from start to the last axis at rest", rested, "ms", baseline=base)
     report.samples("sdev -e from start to exit", calls, "ms", baseline=base)
+    counted.tell(report, "stops of sdev -e")

@@ -10,6 +10,8 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from .figures import Bar, Report
+
 HISTORY = 1024
 """Snapshots kept by watched devices: at 1 kHz a second."""
 SLOWER = 1e-9
@@ -46,17 +48,35 @@ class Watch:
             time.sleep(0.002)
 
 
-def halting_ns(
-    watch: Watch, since_ns: int, deceleration: float | None = None, timeout_s: float = 3.0,
-    look_back_ns: int = LOOK_BACK_NS,
-) -> int:  # fmt: skip
+class Counted:
+    """Looks of trials whose worst is counted: what never came has come when the look ended, and the run goes on.
+
+    Attributes:
+        lost: what has not come, in words.
+    """
+
+    def __init__(self) -> None:
+        self.lost: list[str] = []
+
+    def look(self, look: Callable[[], int]) -> int:
+        """Return an instant, or that of giving up [ns]."""
+        try:
+            return look()
+        except TimeoutError as error:
+            self.lost.append(str(error))
+            return time.monotonic_ns()
+
+    def tell(self, report: Report, what: str) -> None:
+        """Report how many did not come, of which there should be none."""
+        report.value(f"{what} not seen", len(self.lost), "", bars=[Bar("value", 0)], notes="; ".join(self.lost[:3]))
+
+
+def halting_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0, look_back_ns: int = LOOK_BACK_NS) -> int:
     """Return the stamp of the first snapshot in which every axis was commanded slower than at ``since_ns``.
 
     Args:
         watch: of the axes.
         since_ns: when it was that they should halt [ns].
-        deceleration: known constant deceleration of all axes [m/s^2]: then the instant at which the last
-            of them began to brake is returned, instead of the tick that showed it first.
         timeout_s: how long to wait for it [s].
         look_back_ns: some periods of the tick: a snapshot that far before tells the speeds that must fall [ns].
 
@@ -69,11 +89,20 @@ def halting_ns(
         pairs = zip(snapshot.commanded_velocity, before, strict=True)
         return all(abs(now) < abs(was) - SLOWER for now, was in pairs)
 
-    found = watch.first(slower, since_ns, timeout_s, "axes halting")
-    if deceleration is None:
-        return int(found.stamp_ns)
-    lost = min(abs(was) - abs(now) for now, was in zip(found.commanded_velocity, before, strict=True))
-    return int(found.stamp_ns) - int(lost / deceleration * 1e9)
+    return int(watch.first(slower, since_ns, timeout_s, "axes halting").stamp_ns)
+
+
+def slowing_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0, look_back_ns: int = LOOK_BACK_NS) -> int:
+    """Return the stamp of the first snapshot in which every axis was measured a hundredth slower than at ``since_ns``.
+
+    Args, Raises: as halting_ns.
+    """
+    before = watch.first(lambda s: True, since_ns - look_back_ns, timeout_s, "a first look").velocity
+
+    def slower(snapshot: Any) -> bool:
+        return all(abs(now) < 0.99 * abs(was) for now, was in zip(snapshot.velocity, before, strict=True))
+
+    return int(watch.first(slower, since_ns, timeout_s, "axes slowing down").stamp_ns)
 
 
 def standing_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0) -> int:

@@ -33,6 +33,15 @@ def axes(
     return head + "".join(f'[[device.{name}.axis]]\nname = "a{i}"\n{one}' for i in range(count))
 
 
+def stepper(name: str, *, tick_hz: float = 1000.0, capacity: int = 16384) -> str:
+    """Return a device of one simulated stepper axis, named a0."""
+    return (
+        f'[device.{name}]\ndriver = "sim-axes"\nrealtime_priority = 50\nlate_max_s = 0.5\ntick_hz = {tick_hz}\n'
+        f'capacity = {capacity}\n[[device.{name}.axis]]\nname = "a0"\nvelocity_max = 0.5\nacceleration_max = 5.0\n'
+        "stepper = { mass = 0.1, step = 1e-3, hold_force = 20.0, coulomb = 1.0 }\n"
+    )
+
+
 def force(name: str, *, tick_hz: float = 1000.0) -> str:
     """Return a device with a six-component force/torque sensor."""
     return f'[device.{name}]\ndriver = "sim-force"\nrealtime_priority = 50\ntick_hz = {tick_hz}\n'

@@ -185,14 +185,23 @@ class CpuTimes:
         return {name: (run_ns(pid) - self._before[name]) / passed for name, pid in self._processes.items()}
 
 
-@contextlib.contextmanager
-def on_one_processor(*pids: int) -> Iterator[None]:
+def on_one_processor(*pids: int) -> contextlib.AbstractContextManager[None]:
     """Keep all threads of some processes on the last processor that they may use."""
-    tasks = [int(task) for pid in pids for task in os.listdir(f"/proc/{pid}/task")]
+    return on_processors({pid: max(os.sched_getaffinity(pid)) for pid in pids})
+
+
+@contextlib.contextmanager
+def on_processors(places: Mapping[int, int]) -> Iterator[None]:
+    """Keep all threads of processes each on a processor.
+
+    Args:
+        places: processor by pid.
+    """
+    tasks = {int(task): place for pid, place in places.items() for task in os.listdir(f"/proc/{pid}/task")}
     before = {task: os.sched_getaffinity(task) for task in tasks}
     try:
-        for task in tasks:
-            os.sched_setaffinity(task, {max(before[task])})
+        for task, place in tasks.items():
+            os.sched_setaffinity(task, {place})
         yield
     finally:
         for task, processors in before.items():
