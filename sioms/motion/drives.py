@@ -27,7 +27,7 @@ from .queue import EMERGENCY_STOP, FAULT, LOST, AxesLike
 from .settings import AxisSettings
 from .store import NEVER_NS
 from .types import EventKind, MarkerPort
-from .watch import MotionWatch, Order
+from .watch import MotionWatch, Order, order_of
 
 LATCHED = FAULT | EMERGENCY_STOP
 FIRST_REPEAT_NS = 50_000_000
@@ -35,6 +35,10 @@ LONGEST_REPEAT_NS = 1_000_000_000
 """How often a stop is sent again that failed, or that the drive does not obey."""
 DISOBEYED = 4
 """So many stops that a drive has confirmed and does not obey are a fault."""
+LATE_START_NS = 100_000_000
+"""A drive that confirms a common start later than this after its instant is stopped with a fault [ns]: the other axes
+have gone without it. A line is that slow at most: the exchange that it is busy with, then the starts of its drives.
+"""
 
 
 class DriveBank(Bank):
@@ -77,6 +81,9 @@ class DriveBank(Bank):
         self._end_ns = np.full(n, NEVER_NS, dtype=np.int64)
         self._end_fraction = np.zeros(n)
         self._release_ns = np.zeros(n, dtype=np.int64)
+        """Instant of the common start for which the next command waits, 0 for none."""
+        self._common_ns = np.zeros(n, dtype=np.int64)
+        """Instant of the common start that goes out to the drive, 0 for none."""
         self._target = np.zeros(n)
         self._settle_ns = int(settle_s * 1e9)
         self._acknowledged = np.zeros(n, dtype=bool)
@@ -121,7 +128,7 @@ class DriveBank(Bank):
 
     def _drop(self, axes: Axes) -> None:
         self._queue.clear(axes)
-        self._release_ns[axes] = 0
+        self._release_ns[axes] = self._common_ns[axes] = 0
 
     def _emptied(self, axes: Axes) -> None:
         """Stop what was to be replaced by a command that has been flushed."""
@@ -263,6 +270,9 @@ class DriveBank(Bank):
             return
         self._acknowledged[action.axis] = True
         self._started_ns[action.axis] = now_ns
+        if action.kind is ActionKind.START:
+            self._refuse_late(action.axis, int(self._common_ns[action.axis]), now_ns)
+            self._common_ns[action.axis] = 0
         if action.is_stop:
             self._refused_stop[action.axis] = False
             braking_ns = 2e9 * abs(self._velocity[action.axis]) / self._acceleration_limit[action.axis]
@@ -486,12 +496,25 @@ class DriveBank(Bank):
         free = queue.has_head & ~queue.gated_synch & ~queue.gated_marker & ~self._stopping & ~self._homing
         free &= self._release_ns <= now_ns
         for axis in np.flatnonzero(free).tolist():
+            if self._refuse_late(axis, int(self._release_ns[axis]), now_ns):
+                continue
             running = self._running[axis]
             if self._active[axis] and running is not None:
                 if not is_open_ended(running):
                     continue
                 self._end(axis, now_ns)
             self._start(axis, now_ns)
+
+    def _refuse_late(self, axis: int, start_ns: int, now_ns: int) -> bool:
+        """Stop an axis whose common start has come too late; return whether it has."""
+        if not start_ns or now_ns - start_ns <= LATE_START_NS:
+            return False
+        late, most = (now_ns - start_ns) * 1e-6, LATE_START_NS * 1e-6
+        text = f"axis {self.settings[axis].name} starts {late:.0f} ms after the common start; at most {most:g} ms"
+        one = np.array([axis])
+        self._queue.latch_fault(one, text, now_ns, errno.ETIME)
+        self._abandon(one, now_ns, errno.ETIME, text, fastest=True)
+        return True
 
     def _start(self, axis: int, now_ns: int) -> None:
         command, one = self._queue.heads[axis], np.array([axis])
@@ -524,6 +547,7 @@ class DriveBank(Bank):
         total = fraction + command.time * 1e9
         self._end_ns[axis] = due_ns + int(total) if timed else NEVER_NS
         self._end_fraction[axis] = total % 1.0 if timed else 0.0
+        self._common_ns[axis], self._release_ns[axis] = self._release_ns[axis], 0
         self._queue.has_head[axis] = False
         self._running[axis] = command
         self._outcome[axis] = self._arrivals.tries[axis] = 0
@@ -531,7 +555,7 @@ class DriveBank(Bank):
         if approach is None:
             self._taken[axis] = False
             self._engage(axis, now_ns)
-            self._watch.order(axis, *_order_of(command))
+            self._watch.order(axis, *order_of(command))
             self._actions.append(self._action(ActionKind.START, axis, command))
         elif not self._active[axis] and approach.is_idle_for(self._target[axis], self._position[axis]):
             self._end(axis, now_ns)
@@ -572,11 +596,3 @@ class DriveBank(Bank):
         status |= np.where(self._queue.gated_synch & ~running, int(AxisStatus.WAITING_SYNCH), 0)
         self._status[:] = status
         self._queue.count(self._buffered)
-
-
-def _order_of(command: Command) -> tuple[Order, float]:
-    """Return what a command is to the watch, and its goal."""
-    mode = command.control_mode
-    if mode & modes.POSITION:
-        return Order.POINT, command.position
-    return (Order.RUN, command.velocity) if mode & modes.VELOCITY else (Order.FORCE, 0.0)

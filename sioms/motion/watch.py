@@ -29,6 +29,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from . import modes
+from .commands import Command
 from .settings import AxisSettings
 
 JITTER_S = 0.01
@@ -342,6 +344,14 @@ class MotionWatch:
 
 
 # --- what is the same for axes whose loop the host closes --------------------------------------------
+
+
+def order_of(command: Command) -> tuple[Order, float]:
+    """Return what a command is to the watch, and its goal."""
+    mode = command.control_mode
+    if mode & modes.POSITION:
+        return Order.POINT, command.position
+    return (Order.RUN, command.velocity) if mode & modes.VELOCITY else (Order.FORCE, 0.0)
 
 
 def tolerance_of(axis: AxisSettings) -> float:

@@ -196,3 +196,48 @@ def test_a_soft_limit_that_ends_a_run_or_a_force_is_told():
         assert status & S.FORCE_ENDED == bits and not status & S.FORCE_MODE
         told = [e for e in bank.take_events() if e.kind is EventKind.DROPPED]
         assert [(e.errno, e.text) for e in told] == [(errno.ERANGE, "the soft limit is near")]
+
+
+def _waiting_for_a_start() -> Cell:
+    cell = Cell()
+    cell.write(mode=[MODE.VELOCITY | MODE.WAIT_FOR_EXTERNAL_SYNCH] * 2, axis=[0, 1], velocity=0.5)
+    cell.poll(2)
+    return cell
+
+
+def _is_told_late(cell: Cell) -> None:
+    assert cell.status() & S.FAULT and "after the common start; at most 100 ms" in cell.bank.fault_text(0)
+    assert {e.errno for e in cell.events if e.kind is EventKind.DROPPED} <= {errno.ETIME}
+    assert not cell.status() & S.WAITING_SYNCH
+
+
+def test_a_common_start_that_was_slept_through_is_a_fault_and_moves_nothing():
+    cell = _waiting_for_a_start()
+    cell.bank.synch([0, 1], cell.now_ns + 25_000_000, cell.now_ns)
+    cell.now_ns += 25_000_000 + 183_000_000  # the process was held up, or the line
+    cell.poll(20)
+    assert ActionKind.START not in cell.drives[0].log and cell.drives[0].position == 0.0
+    _is_told_late(cell)
+
+
+def test_a_common_start_that_the_drive_confirms_too_late_is_stopped_and_told():
+    cell = _waiting_for_a_start()
+    start_ns = cell.now_ns + 25_000_000
+    cell.bank.synch([0, 1], start_ns, cell.now_ns)
+    cell.bank.advance(start_ns)
+    (first, _) = cell.bank.take_actions()
+    cell.drives[first.axis].take(first)
+    cell.now_ns = start_ns + 183_000_000
+    cell.bank.action_done(first, cell.now_ns)
+    cell.poll(50)
+    assert cell.drives[0].velocity == 0.0 and cell.drives[0].log[-1] is ActionKind.QUICK_STOP
+    _is_told_late(cell)
+
+
+def test_what_follows_a_common_start_is_late_for_nothing():
+    cell = _waiting_for_a_start()
+    cell.bank.synch([0, 1], cell.now_ns + 25_000_000, cell.now_ns)
+    cell.poll(50)
+    cell.write(mode=[MODE.VELOCITY] * 2, axis=[0, 1], velocity=-0.5)
+    cell.poll(50)
+    assert not cell.status() & S.FAULT and cell.drives[0].log == [ActionKind.START, ActionKind.START]
