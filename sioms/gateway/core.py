@@ -17,11 +17,13 @@ from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
 from sioms.protocol.journal import JOURNAL_SIZE, pack_events
 from sioms.protocol.link import Down, MalformedFrame, Up, Update
-from sioms.protocol.messages import MalformedMessage, decode_reply, refusal, reply, value_of
+from sioms.protocol.messages import MalformedMessage, decode, decode_reply, refusal, reply, value_of
 
 from .parts import Followed, Held, Outside, Principal, Session
 
 KEEPALIVE = verbs.Keepalive().packed()
+UNUSUAL = (b"\xdc", b"\xdd")
+"""First bytes of arrays of more than 15 parts, or that are packed as if they were."""
 
 OWN_NUMBERS = 1 << 52
 """Message numbers from here on are the gateway's own requests."""
@@ -49,6 +51,15 @@ JOURNAL_NS = 20_000_000
 """How often events of journals are sent."""
 JOURNAL_BYTES = 48 << 10
 """Bytes of events in one frame, but for the last one; more come with the next."""
+
+
+def _verb(packet: bytes) -> int:
+    """Return the verb of a packet for a driver, however it is packed; -1 for what is none, which the driver judges."""
+    if len(packet) > 1 and packet[0] & 0xF0 == 0x90 and packet[1] < 0x80:
+        return packet[1]
+    if packet[:1] in UNUSUAL or (packet and packet[0] & 0xF0 == 0x90):
+        return int(decode(packet)[0])
+    return -1
 
 
 class Gateway:
@@ -174,6 +185,8 @@ class Gateway:
             if held.lease_ns and stamp_ns - held.told_ns > held.lease_ns // TOLD:
                 held.told_ns = stamp_ns
                 held.node.send(verbs.Heard(stamp_ns).packed())
+            if _verb(packet) == verbs.Heard.verb:
+                raise MalformedMessage("how old a word is, is the gateway's to say")
             if packet != KEEPALIVE:
                 held.node.send(packet)
         except OSError:

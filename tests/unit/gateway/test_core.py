@@ -298,6 +298,17 @@ def test_the_driver_is_told_how_old_its_clients_word_is_so_that_a_gateway_that_f
     assert set(said(node)) == {WRITE}, "nothing that renews from now on"
 
 
+@pytest.mark.parametrize(
+    "packed", [b"\x93\x07\x00", b"\x93\xcc\x07\x00", b"\xdc\x00\x03\x07\x00", b"\xdd\x00\x00\x00\x03\xcd\x00\x07\x00"]
+)
+def test_a_client_does_not_say_how_old_its_own_word_is(world: World, packed: bytes) -> None:
+    """The driver would take that of a client whose word lay in a slow link for new."""
+    world.begin(b"a")
+    node = world.open(b"a", 5)
+    world.frame(b"a", Up.PACKET, 5, packed + b"\xcf" + (world.now_ns + MS).to_bytes(8, "big"))
+    assert b"a" not in world.gateway.sessions and not said(node)
+
+
 def test_what_comes_late_renews_a_lease_from_when_its_client_was_told_the_time(world: World) -> None:
     world.begin(b"a")
     node = world.open(b"a", 5)
