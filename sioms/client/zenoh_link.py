@@ -60,9 +60,18 @@ class ZenohLink:
             os.close(self._came)
             raise _reason(what, host, port, folder, error) from None
         name = f"{mine.number}/{secrets.token_hex(8)}"
-        session, live = self._session, self._session.liveliness()
-        self._closing = threading.Lock()
+        self._closing, self._waking = threading.Lock(), threading.Lock()
         atexit.register(self._end)  # or threads of Zenoh would call an interpreter that has ended
+        try:
+            self._declare(name)
+        except zenoh.ZError as error:  # the connection has ended meanwhile
+            self.close()
+            raise OSError(errno.EIO, f"{what}: the connection has ended at once: {error}") from None
+        self.stop(link.pack(Up.HELLO))
+
+    def _declare(self, name: str) -> None:
+        """Say what is sent and taken under a name."""
+        session, live = self._session, self._session.liveliness()
         self._declared = [
             session.declare_subscriber(f"{DOWN}/{name}", Callback(self._take, indirect=False)),
             live.declare_subscriber(GATEWAY, Callback(self._gateway, indirect=False), history=True),
@@ -70,7 +79,6 @@ class ZenohLink:
         ]
         self._up = self._publisher(f"{UP}/{name}", zenoh.Priority.INTERACTIVE_HIGH)
         self._stop = self._publisher(f"{STOP}/{name}", zenoh.Priority.REAL_TIME)
-        self.stop(link.pack(Up.HELLO))
 
     def _publisher(self, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
         block = zenoh.CongestionControl.BLOCK
@@ -79,8 +87,9 @@ class ZenohLink:
     # --- threads of Zenoh ------------------------------------------------------------------------
 
     def _wake(self) -> None:
-        with suppress(OSError):
-            os.eventfd_write(self._came, 1)
+        with self._waking:
+            if self._came >= 0:  # closed, its number may be another file's
+                os.eventfd_write(self._came, 1)
 
     def _take(self, sample: zenoh.Sample) -> None:
         frame = sample.payload.to_bytes()
@@ -126,7 +135,10 @@ class ZenohLink:
         """Let go of everything."""
         self._end()
         atexit.unregister(self._end)
-        os.close(self._came)
+        with self._waking:
+            if self._came >= 0:
+                os.close(self._came)
+                self._came = -1
 
     def _end(self) -> None:
         """End Zenoh's session; who comes second waits for the first."""

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import zenoh
@@ -21,6 +22,7 @@ from sioms.bench.watching import Watch, halting_ns
 from sioms.check.remote import Relay, ZenohGateway
 from sioms.client.keys import VARIABLE, Folder
 from sioms.client.zenoh_keys import ALIVE, DOWN, STOP, UP, config, endpoint
+from sioms.client.zenoh_link import ZenohLink
 from sioms.gateway import certificates
 from sioms.protocol import link
 from sioms.protocol.link import DEFAULT_LEASE_S, Up
@@ -203,6 +205,30 @@ def test_who_has_no_good_certificate_is_told_why(
         sioms.Workcell("zenoh://127.0.0.1:9")
     with raises(errno.EACCES, "is not taken: Hostname mismatch"):
         sioms.Workcell(f"zenoh://localhost:{gate.port}")
+
+
+def test_a_link_that_ends_while_it_is_made_is_an_error_and_leaves_nothing(
+    gate: ZenohGateway, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def ends(self: ZenohLink, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
+        raise zenoh.ZError("session closed")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(ZenohLink, "_publisher", ends)
+        before = len(os.listdir("/proc/self/fd"))
+        with raises(errno.EIO, "the connection has ended at once"):
+            sioms.Workcell(gate.socket)
+        wait_for(lambda: len(os.listdir("/proc/self/fd")) <= before, "its descriptors to be closed")
+    made = ZenohLink("test", gate.socket, "127.0.0.1", gate.port, 5.0)
+    number = made.fds[0]
+    made.close()
+    other = os.eventfd(0, os.EFD_NONBLOCK)
+    os.dup2(other, number)  # as any file that is opened next
+    made._take(SimpleNamespace(payload=SimpleNamespace(to_bytes=lambda: b"late")))  # type: ignore[arg-type]
+    with raises(errno.EAGAIN, ""):
+        os.eventfd_read(other)
+    for fd in {other, number}:
+        os.close(fd)
 
 
 def test_a_program_that_closes_nothing_ends_in_order(daemon: Daemon, gate: ZenohGateway) -> None:
