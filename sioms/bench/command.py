@@ -37,6 +37,9 @@ BENCHES: dict[str, tuple[str, str]] = {
     "reach": ("reach", "through a gateway: requests, readings, stops; what fails to axes halting"),
     "clocks": ("clocks", "the stated error of a remote clock beside the truth, on simulated clocks and links"),
     "links": ("links", "clients, links and gateways that fail, many at a time: --trials N lost clients"),
+    "zenohlinks": ("links", "the same over Zenoh"),
+    "rights": ("rights", "attacks of a holder of a key on rights that it has not: --trials N of each"),
+    "strangers": ("strangers", "frames of peers without an allowed key: --frames N; none is taken apart"),
     "fleet": ("fleet", "eight cells over Zenoh: stops, starts, reconnections, strangers"),
     "drivers": (
         "drivers",

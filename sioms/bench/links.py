@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from sioms.check.daemon import Daemon, descriptors, wait_for
-from sioms.check.remote import Gateway
+from sioms.check.remote import Gateway, ZenohGateway
 from sioms.client.command import command
 from sioms.client.workcell import Workcell
 from sioms.protocol.link import DEFAULT_LEASE_S
@@ -87,6 +87,11 @@ def bench_links(options: Options, report: Report, kind: type[Gateway] = Gateway)
                 report.progress(f"links: {tally.trials} of {wanted}")
         finally:
             _tell(tally, intruder, report)
+
+
+def bench_zenohlinks(options: Options, report: Report) -> None:
+    """The same over Zenoh."""
+    bench_links(options, report, ZenohGateway)
 
 
 def _tell(tally: Tally, intruder: Intruder, report: Report) -> None:

@@ -223,9 +223,9 @@ def _pull_once(daemon: Daemon, kind: type[Gateway]) -> int:
             gateway = kind(daemon.socket, host=other_host.CELL)
         with gateway:
             with hosts.on(other_host.CLIENT):
-                victim = _cruiser(gateway.socket)
+                victim = cruiser(gateway.socket)
             try:
-                with _cruising(victim, cell) as node:
+                with cruising(victim, cell) as node:
                     watch, begin = Watch(node), time.monotonic_ns()
                     hosts.pull()
                     return halting_ns(watch, begin) - begin
@@ -234,7 +234,7 @@ def _pull_once(daemon: Daemon, kind: type[Gateway]) -> int:
                 victim.wait()
 
 
-def _cruiser(address: str) -> subprocess.Popen[str]:
+def cruiser(address: str) -> subprocess.Popen[str]:
     """Start a client that moves axes."""
     return subprocess.Popen(
         [sys.executable, "-P", "-c", _CRUISE, address, str(SPEED)], stdout=subprocess.PIPE, text=True,
@@ -243,7 +243,7 @@ def _cruiser(address: str) -> subprocess.Popen[str]:
 
 
 @contextmanager
-def _cruising(victim: subprocess.Popen[str], cell: Workcell) -> Iterator[Any]:
+def cruising(victim: subprocess.Popen[str], cell: Workcell) -> Iterator[Any]:
     """Wait until its axes cruise; give their node."""
     assert victim.stdout is not None
     victim.stdout.readline()
@@ -256,10 +256,10 @@ def _cruising(victim: subprocess.Popen[str], cell: Workcell) -> Iterator[Any]:
 def _fail_once(what: str, daemon: Daemon, kind: type[Gateway]) -> int:
     """Let something fail while a remote client moves axes; return how long they went on [ns]."""
     with kind(daemon.socket) as gateway, Relay(gateway.port) as relay, daemon.cell() as cell:
-        victim = _cruiser(gateway.trusted(relay.port))
+        victim = cruiser(gateway.trusted(relay.port))
         stopped = 0
         try:
-            with _cruising(victim, cell) as node:
+            with cruising(victim, cell) as node:
                 watch, begin = Watch(node), time.monotonic_ns()
                 match what:
                     case "client killed":

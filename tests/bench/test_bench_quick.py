@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from sioms.bench.figures import Bar, Report, Summary
+from sioms.bench.rights import ATTACKS
 
 NAMES = ("p50", "p90", "p99", "p99.9", "max")
 
@@ -58,6 +59,16 @@ def test_no_reading_is_older_than_what_was_acknowledged(tmp_path: Path) -> None:
 def test_two_writers_never_both_win(tmp_path: Path) -> None:
     figures = bench(tmp_path, "race")
     assert next(f for f in figures if f["name"] == "races without exactly one winner")["value"] == 0
+
+
+def test_who_holds_a_key_or_none_gains_nothing_at_a_gateway(tmp_path: Path) -> None:
+    """Each attack finds what it is given granted before, and a frame of a client that is let in counted."""
+    figures = bench(tmp_path, "rights", "strangers", "--trials", "1", "--frames", "12000")
+    attacks = [f for f in figures if f["name"].startswith("rights gained")]
+    assert len(attacks) == len(ATTACKS) and all(f["value"] == 0 for f in attacks), attacks
+    found = {f["name"]: f for f in figures}
+    assert found["frames of strangers taken apart"]["value"] == 0
+    assert found["the gateway serves others afterwards"]["value"] == 1
 
 
 def test_an_unknown_name_is_refused_with_those_that_there_are() -> None:
