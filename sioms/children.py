@@ -14,12 +14,16 @@ import subprocess
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from queue import Empty, SimpleQueue
 from typing import IO
 
 PATIENCE_S = 300.0
 """Longest wait for a child [s]: under twenty busy loops a second takes a minute at times."""
+
+KEPT = 500
+"""Lines of a child that are kept: what it says in days is no memory of ours."""
 
 _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)
@@ -61,13 +65,16 @@ class Process:
             [sys.executable, "-P", "-m", *arguments], text=True, preexec_fn=ends_with_us(), **pipe
         )
         stream: IO[str] = self._process.stderr if errors else self._process.stdout
-        self.said: list[str] = []
+        self.said: deque[str] = deque(maxlen=KEPT)
         self._heard: SimpleQueue[str | None] = SimpleQueue()
 
         def listen() -> None:
+            is_waited_for = True
             for line in stream:
                 self.said.append(line.rstrip())
-                self._heard.put(line)
+                if is_waited_for:
+                    self._heard.put(line)
+                is_waited_for = told or (is_waited_for and ready not in line)
             self._heard.put(None)
 
         threading.Thread(target=listen, daemon=True).start()
@@ -87,7 +94,7 @@ class Process:
         if line is None:
             self.kill()
             raise RuntimeError(
-                f"start {self._name}: it did not say {self._ready!r}; it said: {' | '.join(self.said[-5:])}"
+                f"start {self._name}: it did not say {self._ready!r}; it said: {' | '.join(list(self.said)[-5:])}"
             )
 
     def _next(self, deadline: float) -> str | None:

@@ -11,6 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+from daemon_rig import wait_for
+
+from sioms.children import KEPT, Process
 
 TREE = Path(__file__).resolve().parents[2]
 PARENT = """
@@ -64,3 +67,11 @@ def test_everything_that_a_tool_starts_ends_with_it() -> None:
             if starts and "preexec_fn" not in [keyword.arg for keyword in node.keywords]:
                 loose.append(f"{path.name}:{node.lineno}")
     assert not loose, "started without ends_with_us()"
+
+
+def test_of_what_a_child_says_the_last_lines_are_kept() -> None:
+    """A gateway that logs each session would be a leak of who started it."""
+    child = Process(["timeit", "-n1", "-r1", f"for i in range({3 * KEPT}): print('ready', i)"], "ready")
+    child._process.wait(30.0)
+    wait_for(lambda: child.ready_line.startswith("1 loop"), "its last line")
+    assert len(child.said) == KEPT and child._heard.qsize() <= 2
