@@ -41,6 +41,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     "rights": ("rights", "attacks of a holder of a key on rights that it has not: --trials N of each"),
     "strangers": ("strangers", "frames of peers without an allowed key: --frames N; none is taken apart"),
     "blackbox": ("blackbox", "kills, stops and faults, and what the black box names as their cause: --trials N"),
+    "recorder": ("recorder", "the recorder: share of a core, kills of it: --trials N, every value of a replay"),
     "fleet": ("fleet", "eight cells over Zenoh: stops, starts, reconnections, strangers"),
     "drivers": (
         "drivers",

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from mcap.exceptions import EndOfFile
 from recording_rig import NODES, OFFSET_NS, START_NS, events, slots, write
+from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from sioms.recording import reader
@@ -57,6 +58,19 @@ def test_other_readers_see_what_was_published(tmp_path: Path, is_packed: bool) -
     wrench = found["/force0/wrench"][0]
     assert wrench.header.frame_id == "force0" and wrench.wrench.torque.z == 1 + 5 / 64
     assert found["/sioms/events"][3].text == "Größe" and bytes(found["/sioms/events"][3].raw) == b"raw" * 3
+
+
+def test_a_second_reader_opens_a_packed_file_by_its_index(tmp_path: Path) -> None:
+    """Rosbags has a reader of MCAP of its own, which knows nothing of the reference one."""
+    path = write(tmp_path / "a.mcap")
+    assert rewrite([str(path)], str(path)) == []
+    with AnyReader([path]) as bag:
+        assert bag.message_count == 1005 and bag.topics["/mod0/snapshot"].msgcount == 200
+        wanted = [connection for connection in bag.connections if connection.topic == "/mod0/snapshot"]
+        found: list[Any] = [bag.deserialize(raw, one.msgtype) for one, _, raw in bag.messages(wanted)]
+    raw = slots(NODES[0], 1, 200)
+    assert b"".join(message.position.tobytes() for message in found) == raw[:, 4:7].tobytes()
+    assert [message.number for message in found] == list(range(1, 201))
 
 
 @pytest.mark.parametrize("is_packed", [False, True])
