@@ -42,6 +42,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     "strangers": ("strangers", "frames of peers without an allowed key: --frames N; none is taken apart"),
     "blackbox": ("blackbox", "kills, stops and faults, and what the black box names as their cause: --trials N"),
     "recorder": ("recorder", "the recorder: share of a core, kills of it: --trials N, every value of a replay"),
+    "crowd": ("crowd", "a hundred remote readers, one of which is stopped: local reads and writes beside them"),
     "fleet": ("fleet", "eight cells over Zenoh: stops, starts, reconnections, strangers"),
     "drivers": (
         "drivers",
