@@ -19,9 +19,9 @@ the axes a tick earlier than those of another process.
 
 A device with ``carries = "world.left_joints"``, a node of a ``sim-world``, carries a finger there: its first three
 motors are the finger's joints x, y and th, and bear the springs of its mount. An axis with a ``load_node``, an analog
-node of one channel, bears the force there [N or N m] beside that of its motor, for what answers slowly. While such a
-node is not there the device is lost: its axes stop. A world that waits for its axes holds the loads it showed last, and
-its springs pull at nothing.
+node of one channel, bears the force there [N or N m] beside that of its motor, for what answers slowly. Where such a
+node tells nothing (its world is gone, stands still or is late), nothing is borne, brakes hold the axes, and what moves
+is in fault until it is reset.
 
 An axis with a ``model_file`` (as ``sioms reconcile`` writes it) is the twin of the axis that the model was found
 for: mass, friction, encoder and all effects come from the file, stops and switches from ``motor``. The name and a
@@ -31,9 +31,10 @@ check sum of the model show in the plant's description, so that a reload takes u
 from __future__ import annotations
 
 import errno
+import math
 import time
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Annotated, Any, ClassVar
 
@@ -44,13 +45,12 @@ from numpy.typing import NDArray
 
 from sioms.motion import SWITCH_HOME, SWITCH_MINUS, SWITCH_PLUS, AxisBank, AxisKind, AxisSettings
 from sioms.plant.binary import Beam, Box, port_values
-from sioms.plant.carried import Carried
 from sioms.plant.effects import Effect, build_effects, parse_effects
 from sioms.plant.foreign import Laws, TwinAxes, twin
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor
 from sioms.plant.stepper import Stepper, StepperBank
-from sioms.protocol.flags import AnalogStatus, ControlMode, NodeClass
+from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, AxisBlock, BinaryBlock, BlockSpec, Description
 from sioms.sdk.driver import Kit, QuietSteps, TickDriver
@@ -59,11 +59,12 @@ from sioms.sdk.pages import Pages
 from sioms.sdk.tables import from_table, table_type
 
 from .axes_step import EDGE
+from .borne import JOINTS, Borne
 from .quiet_axes import QuietAxes
 
-_JOINTS = 3
 # A profile takes some 20 us to plan; few at a time, so that a plan never delays a tick.
 _PLANS, _SLACK_NS = 8, 300_000
+_FAULT = int(AxisStatus.FAULT)
 
 Array = NDArray[np.float64]
 
@@ -114,6 +115,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         axis: the axes.
         beam: light beams that look at them.
         carries: node of a world with the joints of a finger; none when empty.
+        world_age_max_s: an older reading of that node tells nothing; nor is a finger carried on after a later tick.
         tick_hz: rate of the control loop.
         capacity: commands that each axis buffers.
         effects: effects beyond the motors' parameters, a table per axis name or "*".
@@ -125,6 +127,7 @@ class SimAxesSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     axis: list[AxisTable]
     beam: list[BeamTable] = []
     carries: str = ""
+    world_age_max_s: float = 0.05
     tick_hz: float = 1000.0
     capacity: int = 16384
     effects: dict[str, dict[str, Any]] = {}
@@ -148,8 +151,12 @@ class SimAxes(TickDriver):
         if not settings.axis:
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
         motors, _, _ = _build(settings)
-        if settings.carries and (motors is None or motors.position.size < _JOINTS):
-            raise ValueError(f"carries: fewer than {_JOINTS} motors; want those of a finger's joints x, y and th first")
+        if settings.carries and (motors is None or motors.position.size < JOINTS):
+            raise ValueError(f"carries: fewer than {JOINTS} motors; want those of a finger's joints x, y and th first")
+        if not 1.0 / settings.tick_hz < settings.world_age_max_s < math.inf:
+            raise ValueError(
+                f"world_age_max_s {settings.world_age_max_s:g}; want more than a tick, {1 / settings.tick_hz:g} s"
+            )
         return cls._describe(settings)
 
     @staticmethod
@@ -182,7 +189,7 @@ class SimAxes(TickDriver):
             tick_s=1 / settings.tick_hz,
             markers=kit.markers,
             capacity=settings.capacity,
-            late_max_s=settings.late_max_s,
+            late_max_s=_late_max_s(settings),
             makes_up=lambda: self._command is not None and not self._is_still,
         )
         self._axes, self._plant = AxisBlock(axes, self.bank), AnalogBlock(plant)
@@ -192,18 +199,16 @@ class SimAxes(TickDriver):
         stepper = np.array([axis.kind is AxisKind.STEPPER for axis in configured])
         self._servo_rows, self._stepper_rows = np.flatnonzero(~stepper), np.flatnonzero(stepper)
         servos = [axis for axis in _axes(settings) if axis.motor is not None]
-        self._loads = [(row, axis.load_node) for row, axis in enumerate(servos) if axis.load_node]
-        self._constant = self._servos.load_force.copy() if self._servos is not None else np.zeros(0)
-        self._borne = self._constant.copy()
-        """Force on each motor beside its drive and what it carries."""
-        mass = np.array([axis.motor.mass for axis in servos[:_JOINTS]])
-        self._carried = Carried(mass, 1 / settings.tick_hz) if settings.carries else None
-        self._most = np.array([axis.motor.force_max for axis in servos[:_JOINTS]])
+        borne = None
+        if self._servos is not None:
+            own = (self._servos, servos, settings.carries, settings.world_age_max_s, 1 / settings.tick_hz)
+            borne = Borne(*own, lambda node: self.kit.inputs[node])
+        self._borne = borne if borne is not None and borne.any else None
         self._reading = np.zeros(n)
         self._switches = np.zeros(n, dtype=np.int64)
         self._command: Array | None = None
         self._last_ns = 0
-        self._late_ns = int(settings.late_max_s * 1e9)
+        self._late_ns = int(_late_max_s(settings) * 1e9)
         self._stride = min(_stride(axis, 1 / settings.tick_hz) for axis in settings.axis)
         self._ahead = 0
         self._is_still = False
@@ -223,7 +228,7 @@ class SimAxes(TickDriver):
     def quiet_steps(self, pages: Pages, instants: NDArray[np.int64]) -> QuietSteps | None:
         """Return the steps of motors and steppers, unless something else goes on between commands and positions."""
         motors = self._servos
-        if self._loads or self._carried or (motors is not None and motors.has_drive_effects):
+        if self._borne is not None or (motors is not None and motors.has_drive_effects):
             return None
         return QuietAxes(self, pages, instants)
 
@@ -236,7 +241,8 @@ class SimAxes(TickDriver):
         """
         if self._found and self._finish_turn(now_ns):
             return
-        self._bear(now_ns)
+        if self._borne is not None:
+            self._bear(self._borne, now_ns)
         if self._is_still:  # the turns that were left out change nothing; the world keeps to its grid of ticks
             self._last_ns += max(0, (now_ns - self._last_ns) // self._tick_ns - 1) * self._tick_ns
             self._is_still = False
@@ -279,31 +285,23 @@ class SimAxes(TickDriver):
         return behind
 
     def open(self) -> None:
-        """Wait for the loads."""
-        self._bear(time.monotonic_ns())
-
-    def _bear(self, now_ns: int) -> None:
-        """Take the loads from their nodes.
+        """Wait for the loads.
 
         Raises:
             LinkError: one of them is not there.
         """
-        if self._carried is not None:
-            seen = self._seen_at(self.settings.carries, now_ns)
-            stands = int(seen["flags"][0]) & int(AnalogStatus.INVALID)  # while it waits for an axis
-            self._carried.far[:] = 0.0 if stands else seen["value"].reshape(4, -1)
-        for row, node in self._loads:
-            load = self._seen_at(node, now_ns)["value"]
-            self._borne[row] = self._constant[row] + float(load[0])
+        missing = self._borne.missing(time.monotonic_ns()) if self._borne is not None else ""
+        if missing:
+            raise LinkError(f"{missing}: no load is known; want the simulated world there")
 
-    def _seen_at(self, node: str, now_ns: int) -> Mapping[str, NDArray[Any]]:
-        reading = self.kit.inputs[node].read(now_ns)
-        if reading is None:
-            self._command = None  # no motion is made up for
-            if self._servos is not None:
-                self._servos.velocity[:] = 0.0  # a drive that is lost brakes; it does not go on when it comes back
-            raise LinkError(f"{node}: no load is known; want the simulated world there")
-        return reading
+    def _bear(self, borne: Borne, now_ns: int) -> None:
+        """Take the loads; where they are not known any more, or not while axes are to move, all are in fault."""
+        was_known = borne.is_known
+        why = borne.take(now_ns)
+        if why and (was_known or not self.bank.is_idle(self._all)):
+            fresh = np.flatnonzero((self.bank.arrays["latched"] & _FAULT) == 0)
+            if fresh.size:
+                self.bank.fault(fresh, why, now_ns)
 
     def _turn(self, now_ns: int, ticks: int) -> None:
         beside_ns = 0
@@ -326,7 +324,7 @@ class SimAxes(TickDriver):
 
     def is_at_rest(self) -> bool:
         """Whether world and command are at a fixed point; turns that are left out then need not be made up for."""
-        if self._command is None or self._has_effects or self._loads or self._carried:
+        if self._command is None or self._has_effects or self._borne is not None:
             return False
         with np.errstate(invalid="ignore"):
             still = bool((np.abs(self._command - self._seen) <= self._near).all())
@@ -355,12 +353,8 @@ class SimAxes(TickDriver):
         motors = self._servos
         if motors is not None:
             forces = command[self._servo_rows]
-            if self._loads or self._carried is not None:
-                motors.load_force[:] = self._borne
-            if self._carried is not None:
-                first = slice(_JOINTS)
-                drive = np.clip(forces[first], -self._most, self._most) + self._borne[first]
-                motors.load_force[first] += self._carried.force(motors.position[first], motors.velocity[first], drive)
+            if self._borne is not None:
+                self._borne.press(forces, self.bank.arrays["limp"][self._servo_rows])
             motors.advance(forces)
         if self._steppers is not None:
             self._steppers.advance(command[self._stepper_rows])
@@ -396,6 +390,11 @@ class SimAxes(TickDriver):
             if index:
                 self.kit.publish(port, now_ns)
             port.set(0, value, stamp_ns)
+
+
+def _late_max_s(settings: SimAxesSettings) -> float:
+    """Return how late a tick may be [s]; who carries a finger goes on no longer than its world is waited for."""
+    return min(settings.late_max_s, settings.world_age_max_s) if settings.carries else settings.late_max_s
 
 
 def _switch_bits(bank: MotorBank | StepperBank) -> NDArray[np.int64]:

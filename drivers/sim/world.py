@@ -15,8 +15,8 @@ its spring. Where the object truly is shows the node ``pose``, for pictures and 
 
 The stiffness of a mount lies between the axis and its finger, behind the axis's encoder; that of the servo comes in
 series. While an axis is not there the world stands still and its readings are invalid. A world that is killed takes
-what leans on it along: axes that carry a finger or have a ``load_node`` of it are lost, fingers and force sensors read
-invalid. World and axes see each other late; a mount whose damping is too low for that is refused.
+what leans on it along: axes that carry a finger or have a ``load_node`` of it are in fault, fingers and force sensors
+read invalid. World and axes see each other late; a mount whose damping is too low for that is refused.
 """
 
 from __future__ import annotations
@@ -40,7 +40,8 @@ from sioms.sdk.tables import from_table, table_type
 
 MountTable: Any = table_type(Mount)
 
-_CATCH_UP_S = 0.05
+_CATCH_UP = 50
+"""Ticks that the world goes on for at once; for what is later it stands still."""
 _INVALID = int(AnalogStatus.INVALID)
 
 _POSE = (("x", "m"), ("y", "m"), ("angle", "rad"), ("vx", "m/s"), ("vy", "m/s"), ("spin", "rad/s"))
@@ -177,9 +178,9 @@ class SimWorld(TickDriver):
                 mounts = [from_table(Mount, finger.mount) for finger in self.settings.finger]
                 self._world = World(self._body, mounts, known, self.settings.object.pose)
             elif self._missing:  # an axis that is back may be elsewhere
-                self._world.place(known)
+                self._world.shift(known)
             elif elapsed_s > 0.0:
-                elapsed_s = min(elapsed_s, _CATCH_UP_S)
+                elapsed_s = min(elapsed_s, _CATCH_UP / self.settings.tick_hz)
                 self._world.command(known, elapsed_s)
                 self._world.advance(elapsed_s, math.ceil(elapsed_s / self.settings.step_s))
         self._missing = missing

@@ -31,7 +31,7 @@ _SQUEEZE = {
 }  # fmt: skip
 _POWERS: dict[str, Table] = {
     "sim-axes": {
-        "tick_hz": (1, 1000.0),
+        "tick_hz": (1, 1000.0), "world_age_max_s": (-1, 0.05),
         "axis": {**_AXIS, "bandwidth_hz": (1, 30.0), "motor": {"mass": (-2, None), "viscous": (-1, None)}},
     },
     "sim-world": {

@@ -71,6 +71,9 @@ class FrictionStep:
         sliding: dry friction while moving [N].
         breakaway: force that a resting mass withstands [N], at least the sliding friction.
         time_s: duration of a step [s].
+
+    Attributes:
+        resistance: as of ``step``, shape (n,) [N]; it stays until it is changed.
     """
 
     def __init__(
@@ -90,10 +93,10 @@ class FrictionStep:
         minus = np.array(coefficients(viscous.minus, mass, time))
         # Rows (e, p) act on the old velocity, rows (g, q) on the net force.
         mean, half = (plus + minus) / 2, (plus - minus) / 2
-        self.force, self._resistance = np.zeros((2, n))
+        self.force, self.resistance = np.zeros((2, n))
         self._variation = np.ones(n)
         self.record = Friction(
-            n=n, state=state, force=self.force, resistance=self._resistance, variation=self._variation,
+            n=n, state=state, force=self.force, resistance=self.resistance, variation=self._variation,
             plus=breakaway.plus.copy(), minus=-breakaway.minus,
             sliding=(sliding.plus + sliding.minus) / 2, sliding_half=(sliding.plus - sliding.minus) / 2,
             velocity_mean=mean[[0, 2]], velocity_half=half[[0, 2]], force_mean=mean[[1, 3]], force_half=half[[1, 3]],
@@ -111,7 +114,7 @@ class FrictionStep:
         """
         np.copyto(self.force, force)
         if resistance is not None:
-            np.copyto(self._resistance, resistance)
+            np.copyto(self.resistance, resistance)
         if variation is not None:
             np.copyto(self._variation, variation)
         glide(self.record)

@@ -70,6 +70,7 @@ class MotorBank:
         friction = (self._state, mass, body.viscous, body.sliding, body.breakaway)
         self._friction = FrictionStep(*friction, self._substep_s)
         self._whole_tick = FrictionStep(*friction, tick_s)
+        self._has_brakes = False
         self._speed_per_force = tick_s / body.mass
         self._build_forces(tick_s)
         self._build_sensors(motors)
@@ -88,6 +89,11 @@ class MotorBank:
     def has_drive_effects(self) -> bool:
         """Whether a drive changes its command."""
         return bool(self._drive)
+
+    def brake(self, force: Array) -> None:
+        """Have brakes press from now on, dry friction of these forces [N], shape (n,); 0 for none."""
+        np.copyto(self._whole_tick.resistance, force)
+        self._has_brakes = True
 
     def advance(self, force: Array) -> None:
         """Step all motors by one tick under a commanded force [N], shape (n,), finite."""
@@ -220,7 +226,7 @@ class MotorBank:
             self._transmission.predict(motion, self._substep_s)
 
     def _sum_resistance(self) -> Array | None:
-        if not self._dry and not self._drags:
+        if not self._dry and not self._drags and not self._has_brakes:
             return None
         total, motion = self._resistance, self._motion
         total.fill(0.0)
@@ -230,6 +236,7 @@ class MotorBank:
             np.multiply(total, motion.variation, out=total)
         for effect in self._drags:
             effect.add(motion, total)
+        np.add(total, self._whole_tick.resistance, out=total)  # of the brakes
         return total
 
 

@@ -202,6 +202,16 @@ class World:
             finger.place, finger.command = list(joint), list(joint)
             finger.speed, finger.rate, finger.stretch = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0], 0.0
 
+    def shift(self, joints: Sequence[Sequence[float]]) -> None:
+        """Move the joints' commands to where they are now, at once, and the fingers with them, at rest.
+
+        Springs stay bent as they are: a finger that holds the object holds it on.
+        """
+        for finger, joint in zip(self.fingers, joints, strict=True):
+            finger.place = [at + to - was for at, to, was in zip(finger.place, joint, finger.command, strict=True)]
+            finger.command = list(joint)
+            finger.speed, finger.rate = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+
     def advance(self, time_s: float, steps: int) -> None:
         """Go on by `time_s` in equal steps; 0.25 ms or less follow the stiffest contacts."""
         h = time_s / steps

@@ -26,6 +26,8 @@ class Bench:
         self.markers = Markers(MarkerTable(memoryview(bytearray(TABLE_SIZE))), lambda number: None)
         self._pages = []
         self._drivers = []
+        self.halted = []
+        """Drivers whose processes are stopped."""
 
     def now_ns(self):
         return self.clock_ns
@@ -61,7 +63,7 @@ class Bench:
         for _ in range(round(seconds * 1e9 / period)):
             self.clock_ns += period
             for driver, own in self._drivers:
-                if self.clock_ns % own == 0:
+                if self.clock_ns % own == 0 and driver not in self.halted:
                     driver.tick(self.clock_ns)
                     for block in driver.blocks:
                         self._publish(block, self.clock_ns)
@@ -91,6 +93,8 @@ class Bench:
         for index, channel in enumerate(spec.channels):
             node = self.inputs.setdefault(f"{base}.{channel.name}", Input(f"{base}.{channel.name}"))
             node.attach(os.dup(fd), [index], -1)
+        whole = self.inputs.setdefault(base, Input(base))
+        whole.attach(os.dup(fd), list(range(block.n)), -1)
         os.close(fd)
 
     def _publish(self, block, stamp_ns):
