@@ -55,6 +55,10 @@ BENCHES: dict[str, tuple[str, str]] = {
     ),
     "attack": ("attack", "floods by one user beside victims of another"),
     "hand": ("hand", "the hand's acceptance in a simulated plane: kinematics, rolls, regrasps, force, friction cone"),
+    "holding": (
+        "hand_deaths",
+        "program, drivers, world, sensor and daemon killed and stopped while a hand holds: --trials N rounds",
+    ),
     "deaths": (
         "killing",
         "processes killed and stopped at random points, alone and together: --trials N kills",

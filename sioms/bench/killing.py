@@ -316,7 +316,7 @@ def _end(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
         cell.close()
     daemon.process.wait(10.0)
     try:
-        wait_for(lambda: not any(_lives(pid) for pid in (*pids.values(), *servers)), 10.0, "its processes to end")
+        wait_for(lambda: not any(lives(pid) for pid in (*pids.values(), *servers)), 10.0, "its processes to end")
     except TimeoutError:
         tally.is_wrong("processes left", kind)
     daemon.start()
@@ -373,7 +373,7 @@ def send(acts: Sequence[tuple[int, signal.Signals]], chance: random.Random, tall
     return begins
 
 
-def _lives(pid: int) -> bool:
+def lives(pid: int) -> bool:
     """Tell whether a process is there and has not ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] not in "ZX"
