@@ -12,7 +12,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from sioms.check.daemon import CpuTimes, Daemon
+from sioms.check.remote import Gateway
 from sioms.client.command import command
+from sioms.client.workcell import Workcell
 
 from .baseline import interpreter_ns, run_ns
 from .deaths import SPEED, wait_cruising
@@ -49,7 +51,19 @@ def bench_stop(options: Options, report: Report) -> None:
         trials.counted.tell(report, "stops")
         bars = [Bar("p50", 5.0), Bar("p99", 10.0)]
         report.samples("emergency stop to the last of 16 axes at rest", rested, "ms", bars=bars, cpu=cpu.shares())
+        _remote(options, report, daemon, cell, nodes)
         _shell(options, report, daemon, cell, nodes)
+
+
+def _remote(options: Options, report: Report, daemon: Daemon, cell: Any, nodes: list[Any]) -> None:
+    """The same from a client of a gateway."""
+    with Gateway(daemon.socket) as gateway, Workcell(gateway.socket, "far") as far:
+        count = options.kills(20, 500)
+        trials = _trials(count, cell, nodes, report, lambda: far.emergency_stop_workcell("bench"))
+    report.samples("remote emergency stop, call returns", trials.calls, "ms")
+    name = "remote emergency stop to the tick in which the last of 4 drivers brakes"
+    report.samples(name, trials.acted, "ms", bars=[Bar("p50", 2.0)])
+    report.samples("remote emergency stop to the last of 16 axes at rest", trials.rested, "ms")
 
 
 class Trials(NamedTuple):
