@@ -15,6 +15,7 @@ from collections.abc import Callable
 import zmq
 from zmq.utils import z85
 
+from sioms.prompt import be_prompt
 from sioms.protocol.link import MalformedFrame
 from sioms.protocol.messages import MalformedMessage
 
@@ -71,6 +72,7 @@ class Stops:
         self._told.close()
 
     def _run(self) -> None:
+        be_prompt()
         poller = zmq.Poller()
         for sock in (self._zap, self._sock, self._quit):
             poller.register(sock, zmq.POLLIN)

@@ -27,6 +27,7 @@ from zenoh.handlers import Callback
 from sioms.client.certificates import NUMBERS, own
 from sioms.client.keys import Folder
 from sioms.client.zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint
+from sioms.prompt import be_prompt
 from sioms.protocol import link
 from sioms.protocol.link import Down, MalformedFrame
 from sioms.protocol.messages import MalformedMessage
@@ -243,6 +244,7 @@ class Zenoh:
             yield asked
 
     def _run_stops(self) -> None:
+        be_prompt()
         for number, name, frame in self._asked():
             try:
                 who = self._loop.principal(number)

@@ -15,8 +15,9 @@ from typing import Any
 from sioms.arguments import positive
 from sioms.client.workcell import Workcell
 from sioms.documents import json_text
+from sioms.prompt import be_prompt
 from sioms.recording.live.box import KEPT_S, Box
-from sioms.recording.live.recorder import Recorder, be_prompt
+from sioms.recording.live.recorder import Recorder
 from sioms.recording.reader import Recording
 from sioms.recording.story import happened, sentence, tell, utc
 from sioms.whole_file import write_whole

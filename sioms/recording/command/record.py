@@ -11,8 +11,9 @@ from typing import Any
 
 from sioms.arguments import positive
 from sioms.client.workcell import Workcell
+from sioms.prompt import be_prompt
 from sioms.recording.live.files import LiveFile
-from sioms.recording.live.recorder import Recorder, be_prompt
+from sioms.recording.live.recorder import Recorder
 
 
 def size(text: str) -> int:

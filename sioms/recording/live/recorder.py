@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import errno
 import json
-import os
 import socket
 import time
 from collections.abc import Callable, Sequence
@@ -283,12 +282,3 @@ def _boot() -> str:
             return file.read().strip()
     except OSError:
         return ""
-
-
-def be_prompt() -> bool:
-    """Ask for the lowest real-time priority, so that a busy machine costs no snapshots; return whether it was given."""
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
-    except OSError:
-        return False
-    return True
