@@ -48,6 +48,7 @@ from sioms.reconcile.variation import named as varied
 AGAIN = 2  # times that the noise is taken again at most
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a model that leaves is told by its error, not by a warning
 def analyse(session: Session, nominal: AxisModel, options: Options | None = None) -> AxisVerdict:
     """Find what the nominal model of a motor axis lacks.
 

@@ -113,8 +113,8 @@ def _check_jumps(r: Record, model: AxisModel, where: str) -> None:
         size = max(abs(r.position[i + 1] - r.position[i]), abs(r.position[i] - r.position[i - 1]))
         raise BadInputError(
             f"{where}: position leaps by {size:.4g} {model.position_unit} at sample {i} ({len(odd)} such places), "
-            f"{bend[i - 1] / usual:.0f} times as far as its motion goes elsewhere: a wrapped angle, lost counts or a "
-            "spike; unwrap it, or cut the record there"
+            f"{bend[i - 1] / usual:.0f} times as far as its motion goes elsewhere: a wrapped angle, lost counts, a "
+            "spike, or a log that stood still meanwhile; unwrap it, or cut the record there"
         )
 
 

@@ -10,14 +10,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sioms.reconcile.checks import in_another_unit
 from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.model import AxisModel
+from sioms.reconcile.records import Record
 from sioms.reconcile.screen import Motion, bandwidth, dead_band, direction, low_passed, smoothed_motion
-from sioms.reconcile.thresholds import INERTIAS, UNLIKE, UNRELATED
+from sioms.reconcile.thresholds import FORETOLD, INERTIAS, UNLIKE, UNRELATED
 
 #: Beyond these multiples of the nominal inertia it is said.
 UNLIKELY = 0.5, 4.0
@@ -25,6 +27,8 @@ UNLIKELY = 0.5, 4.0
 #: are compared, these.
 SHOWN, FITS = 0.02, 0.2
 SHOWN_ALONE, FITS_ALONE = 0.3, 0.8
+#: Rows of the past that foretell, strides at which they are read, and rows at least.
+PAST, STRIDES, LEAST_ROWS = 12, (1, 2, 4, 8), 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,13 +56,51 @@ def check_scale(problem: Problem, model: AxisModel) -> list[str]:
     """
     columns, forces = _columns(problem, model)
     whole = _seen(problem.join(columns), problem.join(forces), SHOWN, FITS)
-    if whole.explained < UNRELATED:
+    if whole.explained < UNRELATED and follows(problem.session.records) < FORETOLD:
         raise BadInputError(
             f"compare force with motion: inertia, friction and forces of place explain {100 * whole.explained:.0f} % "
             "of the force: force and position are not of the same run, or not of the same rows"
         )
     _check_alike(problem, columns, forces)
+    if whole.explained < UNRELATED:
+        return [
+            f"inertia, friction and forces of place explain {100 * whole.explained:.0f} % of the force, and yet the "
+            "motion follows from it: something swings between them (an elastic transmission, a hanging load, a filter)"
+        ]
     return _check_ratio(whole.inertia, model)
+
+
+def follows(records: Sequence[Record]) -> float:
+    """Return the share of what is new in the acceleration that the force foretells, as in any linear machine.
+
+    The acceleration is predicted from its own past, and from that and the past force, by least squares on the first
+    half of each record; the shares are of the second half, the largest of the strides at which the rows are read, as a
+    fine sampling buries the motion in noise. Source: C. W. J. Granger, Econometrica 37 (1969) 424.
+    """
+    return max(_foretold(records, stride) for stride in STRIDES)
+
+
+def _foretold(records: Sequence[Record], stride: int) -> float:
+    own, both = 0.0, 0.0
+    for r in records:
+        x, u = r.position[::stride], r.force[::stride][1:-1]
+        a = np.diff(x, 2)
+        if len(a) < LEAST_ROWS or np.ptp(a) == 0.0:
+            continue
+        a, u = a / np.std(a), u / max(float(np.std(u)), 1e-300)
+        past = sliding_window_view(a[:-1], PAST)
+        forces = sliding_window_view(u, PAST + 1)
+        for i, columns in enumerate((past, np.hstack([past, forces]))):
+            left = _left(columns, a[PAST:])
+            own, both = (own + left, both) if i == 0 else (own, both + left)
+    return 1.0 - both / own if own > 0.0 else 0.0
+
+
+def _left(columns: Array, of: Array) -> float:
+    """Return the energy that a regression on the first half leaves of the second."""
+    half = len(of) // 2
+    c = np.linalg.lstsq(columns[:half], of[:half], rcond=1e-10)[0]
+    return float(np.sum((of[half:] - columns[half:] @ c) ** 2))
 
 
 def inertia_seen(problem: Problem, model: AxisModel) -> float | None:

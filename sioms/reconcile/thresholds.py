@@ -54,6 +54,10 @@ LAWLESS = 0.5
 UNRELATED = 0.3
 """Force and motion have nothing to do with each other where inertia, friction and forces of place together explain less
 than this share of the force. Forty axes: 0.54 beside a gap, 0.74 else (0562)."""
+FORETOLD = 0.5
+"""... unless the force foretells this share of what is new in the acceleration on held-out rows: two inertias driven
+about the frequency at which the second swings alone 0.9 and more; thirty sines of other phases, which a filter can turn
+into one another, 0.34, other forces at most 0.002 (0770)."""
 INERTIAS = 0.3, 21.0
 """The inertia that force and motion show is between these multiples of the nominal one, by a payload; beyond them it
 is a unit, a sample time (every second row lost makes 0.25), or another axis. Forty axes: 0.51 to 2.95 (0562)."""

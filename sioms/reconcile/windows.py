@@ -166,7 +166,7 @@ class View:
         if not np.any(f):
             return None
         value, spread, left = self.fitted(f)
-        weight = left / len(self.rows) / np.maximum(spread, 1e-150) ** 2
+        weight = left / len(self.rows) / np.clip(spread, 1e-150, 1e150) ** 2
         ends = np.cumsum([len(c) - 1 for c in self.cuts])[:-1]
         return Read(np.split(value, ends), np.split(weight, ends), left)
 
