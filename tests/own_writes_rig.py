@@ -20,6 +20,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from ownership_fakes import Timer
 
 import sioms.client.node_core
 import sioms.native.language
@@ -47,22 +48,6 @@ from sioms.sdk.settings import LineSettings
 
 SEED = int(os.environ.get("SIOMS_SEED", "0"))
 Done = Callable[[Any], None]
-
-
-class _Timer:
-    """A timer descriptor without time: the rig says what has expired."""
-
-    def __init__(self) -> None:
-        self.fd = os.eventfd(0)
-        self.expired = 0
-
-    def set(self, first_ns: int, period_ns: int = 0) -> None:
-        """Nothing: the rig knows when it ticks."""
-
-    def expirations(self) -> int:
-        """Return how many periods are over."""
-        expired, self.expired = self.expired, 0
-        return expired
 
 
 class Client:
@@ -344,7 +329,7 @@ def own_time(world: list[World]) -> Iterator[None]:
         patch.setattr(time, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "sleep", sleep)
-        patch.setattr("sioms.sdk.runtime.TimerFd", _Timer)
+        patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
         patch.setattr(sioms.sdk.quiet, "run", lambda record: world[0].run_quietly(record))
         patch.setattr(sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings))
         yield

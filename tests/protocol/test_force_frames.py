@@ -1,35 +1,19 @@
 """Frames of the force/torque sensors: the vendors' bytes, whole, in pieces, and among others."""
 
 import errno
-from pathlib import Path
 
 import pytest
+from frames_rig import GOLDEN, feed
 
 from sioms.drivers.ati_rdt import codec as rdt
 from sioms.drivers.ati_rdt import http_get
 from sioms.drivers.ft300 import codec as ft300
 from sioms.drivers.schunk_ft import codec as ifb
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError
-
-GOLDEN = [
-    tuple(line.split("|")) for line in (Path(__file__).parent / "golden_frames.txt").read_text().splitlines()
-    if not line.startswith("#")
-]  # fmt: skip
+from sioms.sdk.exchange import DeviceError, LinkError
 
 
 def golden(family: str, check: str) -> list[bytes]:
     return [bytes.fromhex(text) for name, kind, text in GOLDEN if (name, kind) == (family, check)]
-
-
-def feed(exchange: Exchange, data: bytes, step: int) -> object:
-    """Gather bytes until the reply is complete, as a transport does."""
-    got = b""
-    for i in range(0, len(data), step):
-        got += data[i : i + step]
-        size = exchange.want(got)
-        if size is not None and len(got) >= size:
-            return exchange.decode(got[:size])
-    raise LinkError("incomplete")
 
 
 # --- Robotiq --------------------------------------------------------------------------------------

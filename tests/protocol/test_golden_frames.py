@@ -1,8 +1,7 @@
 """Golden frames: encoders produce them, decoders accept them whole, byte by byte and with trailing bytes."""
 
-from pathlib import Path
-
 import pytest
+from frames_rig import GOLDEN, feed
 
 from sioms.drivers.framed_adc import codec as stream
 from sioms.drivers.framed_adc.cobs import FrameReceiver, frame, unstuff
@@ -11,32 +10,16 @@ from sioms.sdk.codec.modbus import RtuUnit, SerialLine, TcpUnit
 from sioms.sdk.codec.modbus_pdu import read_write_registers
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 
-TABLE = [
-    tuple(line.split("|"))
-    for line in (Path(__file__).parent / "golden_frames.txt").read_text().splitlines()
-    if not line.startswith("#")
-]
 LINE = SerialLine(115200)
 U1, U7, U9, U17 = (RtuUnit(unit, LINE) for unit in (1, 7, 9, 17))
 
 
 def of(check: str) -> list[str]:
-    return [text for _, kind, text in TABLE if kind == check]
-
-
-def feed(exchange: Exchange, data: bytes, step: int) -> object:
-    """Do what a transport does: gather bytes until the reply is complete, cut it off, decode it."""
-    got = b""
-    for i in range(0, len(data), step):
-        got += data[i : i + step]
-        size = exchange.want(got)
-        if size is not None and len(got) >= size:
-            return exchange.decode(got[:size])
-    raise LinkError("incomplete")
+    return [text for _, kind, text in GOLDEN if kind == check]
 
 
 def test_the_table_is_complete() -> None:
-    assert len(TABLE) == 74
+    assert len(GOLDEN) == 74
     assert {kind: len(of(kind)) for kind in ("modbus", "dxl", "ccitt")} == {
         "modbus": 44,
         "dxl": 9,

@@ -1,21 +1,11 @@
 """Grbl's lines: reports with fields in any order, answers among other lines, and what is damaged."""
 
 import pytest
+from frames_rig import feed
 
 from sioms.drivers.grbl import codec as grbl
 from sioms.drivers.grbl import simulator
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, StateLost
-
-
-def feed(exchange: Exchange, data: bytes, step: int) -> object:
-    """Gather bytes until the reply is complete, as a transport does."""
-    got = b""
-    for i in range(0, len(data), step):
-        got += data[i : i + step]
-        size = exchange.want(got)
-        if size is not None and len(got) >= size:
-            return exchange.decode(got[:size])
-    raise LinkError("incomplete")
+from sioms.sdk.exchange import DeviceError, LinkError, StateLost
 
 
 @pytest.mark.parametrize("step", [1, 3, 1000])

@@ -3,21 +3,11 @@
 import math
 
 import pytest
+from frames_rig import feed
 
 from sioms.drivers.odrive import codec as odrive
 from sioms.drivers.odrive import simulator
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError
-
-
-def feed(exchange: Exchange, data: bytes, step: int) -> object:
-    """Gather bytes until the reply is complete, as a transport does."""
-    got = b""
-    for i in range(0, len(data), step):
-        got += data[i : i + step]
-        size = exchange.want(got)
-        if size is not None and len(got) >= size:
-            return exchange.decode(got[:size])
-    raise LinkError("incomplete")
+from sioms.sdk.exchange import DeviceError, LinkError
 
 
 def reply(*texts: str) -> bytes:
