@@ -46,7 +46,6 @@ MODES = {
     "current": (0, (BANK_MODES | ControlMode.FORCE) & ~ControlMode.SPECIFIED_MAX_VEL_ACC),
 }
 """Name of an operating mode: its number in register 11, and the control modes that it gives."""
-RETURN_DELAY_S = 0.0005
 REBOOT_S = 0.5
 HARDWARE_ERRORS = {1: "input voltage", 4: "overheating", 8: "encoder", 16: "electrical shock", 32: "overload"}
 """Bits of register 70 as the e-Manual numbers them for the X series."""

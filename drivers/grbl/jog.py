@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 
 from .codec import jog
 
-PLANNER_BLOCKS = 15
 CHAIN_BLOCKS = 8
-"""Jogs of a chain that may be under way: the rest of the planner is left to moves. A full planner withholds its ok, and
-a line that waits there goes out after a cancel."""
+"""Jogs of a chain that may be under way: the rest of the planner's 15 blocks is left to moves. A full planner withholds
+its ok, and a line that waits there goes out after a cancel."""
 SHORTEST_S = 0.01
 """The planner wants at least this between two jogs of a chain."""
 

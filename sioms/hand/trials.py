@@ -19,7 +19,6 @@ from sioms.plant.planar import Body, Mount
 
 SHAPES = ("disk", "ellipse", "rectangle", "polygon", "spline")
 WITHIN_RAD = math.radians(1.0)
-SURE_FRICTION = 1.4
 _MOST_TRIES = 200
 
 

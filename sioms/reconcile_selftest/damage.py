@@ -181,7 +181,6 @@ def _undescribed(p: Public, other: Public, rng: np.random.Generator) -> Public:
 
 
 CSV = b"time [s],position [rad],force [N m]\n"
-HDF = b"MATLAB 7.3 MAT-file".ljust(512, b"\0") + b"\x89HDF\r\n\x1a\n"
 MEASURED = ("counts", "command", "force", "force_measured")
 LATER: Callable[[int], Callable[[NDArray[Any]], NDArray[Any]]] = lambda n: lambda a: np.roll(a, n)  # noqa: E731
 KINDS: Mapping[str, Damage] = {

@@ -151,10 +151,3 @@ class Connected:
         """Give up the jobs of the line."""
         if self.line is not None:
             self.line.abandon(reason)
-
-    def close_line(self) -> None:
-        """Release the line for good."""
-        if self.line is not None:
-            self._loop.unwatch(self.line.connection.fd)
-            self.line.close()
-            self.line = None
