@@ -424,7 +424,7 @@ async def main() -> None:
     parser.add_argument("--model", type=int, default=1020)
     options = parser.parse_args()
     bus = Bus([int(part) for part in options.ids.split(",")], options.model)
-    await wire.run(bus, options, bus.handlers())
+    await wire.run(bus, options, bus.handlers(), wire.QUIET_S)
 
 
 if __name__ == "__main__":

@@ -350,7 +350,7 @@ async def main() -> None:
     parser.add_argument("--friction", type=float, default=0.05, help="dry friction of the rotors [Nm]")
     options = parser.parse_args()
     board = Board(options.version, options.friction)
-    await wire.run(board, options, board.handlers())
+    await wire.run(board, options, board.handlers(), wire.QUIET_S)
 
 
 if __name__ == "__main__":

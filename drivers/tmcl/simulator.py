@@ -375,7 +375,7 @@ async def main() -> None:
         options.address, options.motors, options.module, heartbeat=not options.no_heartbeat,
         ticks=not options.no_ticks, keeps_heartbeat=options.keeps_heartbeat, silent=options.silent,
     )  # fmt: skip
-    await wire.run(module, options, module.handlers())
+    await wire.run(module, options, module.handlers(), wire.QUIET_S)
 
 
 if __name__ == "__main__":

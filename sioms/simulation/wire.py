@@ -17,6 +17,8 @@ from .faults import Faults
 from .ports import PtyPort
 
 PERIOD_S = 0.002
+QUIET_S = 0.02
+"""How often ``due`` is called of a device that never speaks unasked: what it does meanwhile, it does at its time."""
 
 
 class Device(Protocol):
@@ -26,7 +28,7 @@ class Device(Protocol):
         """Take bytes as they come, cut anywhere, and return the messages that answer them."""
 
     def due(self) -> list[bytes]:
-        """Return what it has to say now; called every 2 ms."""
+        """Return what it has to say now; called once a period."""
 
     def connected(self) -> list[bytes]:
         """A master has come (TCP alone); return what is said to it."""
@@ -92,8 +94,20 @@ def parser(description: str, *, tcp: bool = False) -> argparse.ArgumentParser:
     return options
 
 
-async def run(device: Device, options: argparse.Namespace, handlers: Mapping[str, Callable[..., object]]) -> None:
-    """Serve a device until told to end."""
+async def run(
+    device: Device,
+    options: argparse.Namespace,
+    handlers: Mapping[str, Callable[..., object]],
+    period_s: float = PERIOD_S,
+) -> None:
+    """Serve a device until told to end.
+
+    Args:
+        device: it, on its line.
+        options: of ``parser``.
+        handlers: of commands on standard input.
+        period_s: how often ``due`` is called [s].
+    """
     loop, faults = asyncio.get_running_loop(), Faults()
     character_s = 10 / options.baud if options.baud else 0.0
     free_s = 0.0
@@ -130,7 +144,7 @@ async def run(device: Device, options: argparse.Namespace, handlers: Mapping[str
         while True:
             for message in device.due():
                 send(message)
-            await asyncio.sleep(PERIOD_S)
+            await asyncio.sleep(period_s)
 
     tcp = getattr(options, "tcp", -1)
     port: TcpPort | PtyPort = TcpPort(tcp, received, greet) if tcp >= 0 else PtyPort(options.link, received)
