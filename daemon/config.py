@@ -10,6 +10,7 @@ import math
 import os.path
 import tomllib
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -180,6 +181,12 @@ _SECTIONS = ("workcell", "quota", "device", "node", "grant", "emergency_stop", "
 _COMMON = tuple(field.name for field in msgspec.structs.fields(DeviceTable))
 
 
+@lru_cache(maxsize=1)
+def _document(text: str) -> dict[str, Any]:
+    """Return the tables of a document, which are not to be changed; a start looks into it twice."""
+    return tomllib.loads(text)
+
+
 def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     """Read a configuration.
 
@@ -191,7 +198,7 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
         The configuration and the errors, one sentence each; None when there is nothing to go on with.
     """
     try:
-        root = tomllib.loads(text)
+        root = _document(text)
     except tomllib.TOMLDecodeError as error:
         return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
     except RecursionError:

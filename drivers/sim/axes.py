@@ -36,7 +36,7 @@ import time
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import msgspec
 import numpy as np
@@ -96,6 +96,10 @@ the numbers from 0 behind their name.
 """
 
 
+Built: TypeAlias = tuple[MotorBank | None, StepperBank | None, list[AxisSettings]]
+"""The plants, and the settings of the bank."""
+
+
 class BeamTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """A light beam, the next bit of the port ``beams``: 1 while broken.
 
@@ -150,7 +154,8 @@ class SimAxes(TickDriver):
         """Tell the axes and the plant; reads the effects file, so that its mistakes show before the start."""
         if not settings.axis:
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
-        motors, _, _ = _build(settings)
+        motors, _, _ = built = _build(settings)
+        SimAxes._checked = (settings, built)
         if settings.carries and (motors is None or motors.position.size < JOINTS):
             raise ValueError(f"carries: fewer than {JOINTS} motors; want those of a finger's joints x, y and th first")
         if not 1.0 / settings.tick_hz < settings.world_age_max_s < math.inf:
@@ -176,13 +181,17 @@ class SimAxes(TickDriver):
         inputs = tuple(dict.fromkeys(node for node in (settings.carries, *(axis.load_node for axis in axes)) if node))
         return Description(tuple(blocks), settings.tick_hz, inputs, lease_s=1.0)
 
+    _checked: ClassVar[tuple[SimAxesSettings, Built] | None] = None
+    """What ``describe`` has built to check it; a device that is made of the same settings next takes it."""
     make_up_ns: ClassVar[int] = 20_000_000
     """How long a tick may make up for turns [ns]: a machine that is too slow for them shows its axes in slow motion."""
 
     def __init__(self, name: str, settings: SimAxesSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
         axes, plant, *port = self._describe(settings).blocks
-        self._servos, self._steppers, configured = _build(settings)
+        checked, SimAxes._checked = SimAxes._checked, None
+        built = checked[1] if checked is not None and checked[0] is settings else _build(settings)
+        self._servos, self._steppers, configured = built
         self._tick_ns = round(1e9 / settings.tick_hz)
         self.bank = AxisBank(
             configured,
@@ -415,7 +424,7 @@ def _axes(settings: SimAxesSettings) -> list[Any]:
     return axes
 
 
-def _build(settings: SimAxesSettings) -> tuple[MotorBank | None, StepperBank | None, list[AxisSettings]]:
+def _build(settings: SimAxesSettings) -> Built:
     """Make the plants and the settings of the bank.
 
     Raises:

@@ -24,6 +24,12 @@ _QUANTITIES = (
     modes.POSITION, modes.VELOCITY, modes.ACCELERATION, modes.JERK, modes.FORCE, modes.FORCE_VELOCITY,
 )  # fmt: skip
 _BESIDE = (modes.MAX_VEL_ACC, modes.MAX_FORCE, modes.FORCE_OFFSET, modes.SYNCH)
+_PLAIN = frozenset(
+    quantity | sum(flag for i, flag in enumerate(_BESIDE) if beside >> i & 1)
+    for quantity in _QUANTITIES
+    for beside in range(1 << len(_BESIDE))
+)
+"""Modes of plain records."""
 _COLUMN = {name: i for i, name in enumerate(WIRE_DTYPE.names or ())}
 AXIS = _COLUMN["axis"]
 _MODE, _POSITION = _COLUMN["control_mode"], _COLUMN["position"]
@@ -45,20 +51,25 @@ class PlainCheck:
         self._offered = list(offered)
         self._minimum, self._maximum = limits.minimum, limits.maximum
         self._below, self._above = limits.room_below.tolist(), limits.room_above.tolist()
+        self._limits = limits
         self._checks: dict[int, tuple[Check, ...]] = {}
-        for quantity in _QUANTITIES:
-            for beside in range(1 << len(_BESIDE)):
-                mode = quantity | sum(flag for i, flag in enumerate(_BESIDE) if beside >> i & 1)
-                self._checks[mode] = tuple(
-                    (_COLUMN[rule.field], getattr(limits, rule.bound) if rule.bound else None, rule.positive)
-                    for rule in RULES
-                    if mode & rule.flag
-                )
+        """Of the modes that have been seen."""
+
+    def _checks_of(self, mode: int) -> tuple[Check, ...] | None:
+        """Return what is checked of a record of a mode; None for one that is not plain."""
+        if mode not in _PLAIN:
+            return None
+        checks = self._checks[mode] = tuple(
+            (_COLUMN[rule.field], getattr(self._limits, rule.bound) if rule.bound else None, rule.positive)
+            for rule in RULES
+            if mode & rule.flag
+        )
+        return checks
 
     def command(self, record: tuple[Any, ...], axis: int) -> Command | None:
         """Return a record of the wire as a command of a bank axis; None when it is not plain, or bad."""
         mode = record[_MODE]
-        checks = self._checks.get(mode)
+        checks = self._checks.get(mode) or self._checks_of(mode)
         if checks is None or mode & ~self._offered[axis]:
             return None
         for column, bound, positive in checks:

@@ -78,7 +78,8 @@ class Flags:
     def __setitem__(self, i: int, value: bool) -> None: ...
 
 
-ARRAYS = (Floats, Integers, Flags)
+ARRAYS = frozenset((Floats, Integers, Flags))
+_DTYPES = {kind: np.dtype(kind.dtype) for kind in ARRAYS}
 
 
 class Call:
@@ -145,13 +146,12 @@ class Record:
         if fields.keys() != self.kinds.keys():
             wrong = ", ".join(sorted(fields.keys() ^ self.kinds.keys()))
             raise TypeError(f"make {name}: missing or unknown: {wrong}")
-        for field, value in fields.items():
-            kind = self.kinds[field]
-            if kind in ARRAYS and (
-                not isinstance(value, np.ndarray) or value.dtype != kind.dtype or not value.flags.c_contiguous
-            ):
-                wanted = kind.dtype.__name__
-                raise TypeError(f"make {name}: {field} is {value!r:.80}; want a contiguous array of {wanted}")
+        for field, kind in self.kinds.items():
+            if kind in ARRAYS:
+                value = fields[field]
+                if not isinstance(value, np.ndarray) or value.dtype != _DTYPES[kind] or not value.flags.c_contiguous:
+                    wanted = kind.dtype.__name__
+                    raise TypeError(f"make {name}: {field} is {value!r:.80}; want a contiguous array of {wanted}")
         if library is None:
             for field, value in fields.items():
                 setattr(self, field, value.reshape(-1).data if self.kinds[field] in ARRAYS else value)
@@ -160,7 +160,7 @@ class Record:
         self.pointer = ctypes.addressof(self.made)
         for field, value in fields.items():
             if self.kinds[field] in NUMBERS:
-                setattr(self, field, value)
+                setattr(self.made, field, value)
             else:
                 self.__dict__[field] = value  # it lives as long as what points to it
                 setattr(self.made, field, _address(value))
@@ -208,7 +208,8 @@ def _address(value: Any) -> int:
     if isinstance(value, Record):
         return value.pointer
     if isinstance(value, np.ndarray):
-        return value.ctypes.data
+        address: int = value.__array_interface__["data"][0]
+        return address
     return ctypes.cast(value.compiled, ctypes.c_void_p).value or 0
 
 

@@ -107,7 +107,7 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     table = dict(_anchored(table, folder))
     errors = []
     # The validator names one error; all are looked for only when there is one.
-    top = [field.encode_name for field in msgspec.structs.fields(kind)]
+    top = kind.__struct_encode_fields__
     for key in [k for k in table if k not in top]:
         errors.append(f": unknown key {key}{did_you_mean(key, top)}")
         del table[key]

@@ -40,6 +40,13 @@ def test_a_good_configuration() -> None:
     assert config.folder == "/etc"
 
 
+def test_a_text_that_is_read_twice_gives_the_same_twice() -> None:
+    text = '[device.a]\ndriver = "sim-axes"\nkey = [1]\n[device.b]\nrate = 1\n[strange]\n'
+    first, errors = parse(text, "/")
+    second, again = parse(text, "/")
+    assert first == second and errors == again and errors is not again and len(errors) > 1
+
+
 def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
     found = errors(
         '[workcel]\n[workcell]\nnam = "x"\n[device.a]\n[device.b]\ndriver = 3\n[node.n]\n[[grant]]\nrights = []\nuser '

@@ -392,3 +392,18 @@ def test_a_world_that_is_late_and_at_rest_has_nothing_to_make_up_for(bench):
     bench.run(0.003)
     assert mod.blocks[0].stamp_ns == 0, "it is not late any more"
     assert mod.bank.rows["position"][0] == pytest.approx(0.02, abs=1e-4)
+
+
+def test_what_describe_has_built_goes_to_one_device_of_the_same_settings(bench):
+    def settings(mass):
+        return msgspec.convert({"axis": [SERVO | {"motor": {"mass": mass}}]}, SimAxes.Settings)
+
+    light, heavy = settings(1.0), settings(4.0)
+    SimAxes.describe("mod0", light)
+    devices = [SimAxes("mod0", each, bench) for each in (heavy, light, light)]
+    SimAxes.describe("mod0", light)
+    devices += [SimAxes("mod0", each, bench) for each in (light, heavy)]
+    light_k, heavy_k = devices[1].bank.settings[0].k, devices[0].bank.settings[0].k
+    assert [device.bank.settings[0].k for device in devices] == [heavy_k, light_k, light_k, light_k, heavy_k]
+    assert heavy_k > 3 * light_k
+    assert len({id(device._servos) for device in devices}) == len(devices), "each has a world of its own"
