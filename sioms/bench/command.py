@@ -17,6 +17,7 @@ BENCHES: dict[str, tuple[str, str]] = {
     "update": ("reading", "publication to awake subscriber at 100 Hz and 1 kHz, on one processor"),
     "write": ("writing", "write to acknowledgement: 1, 16 and 10,000 commands"),
     "paced": ("paced", "one read and one write in 10 ms, on one core and across cores, beside bare ones"),
+    "peers": ("peers", "reads and writes beside those of EPICS and Tango, as far as these are installed"),
     "open": ("opening", "open and close, descriptors and memory gained by --soak N of them"),
     "stale": ("stale", "readings older than what was acknowledged: --trials N requests in random order"),
     "race": ("opening", "two writers racing for one output"),
