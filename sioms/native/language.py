@@ -78,8 +78,8 @@ class Flags:
     def __setitem__(self, i: int, value: bool) -> None: ...
 
 
-ARRAYS = frozenset((Floats, Integers, Flags))
-_DTYPES = {kind: np.dtype(kind.dtype) for kind in ARRAYS}
+ARRAYS = (Floats, Integers, Flags)
+_DTYPES: dict[Any, np.dtype[Any]] = {kind: np.dtype(kind.dtype) for kind in ARRAYS}
 
 
 class Call:
