@@ -28,6 +28,8 @@ TREE = Path(__file__).resolve().parents[1]
 DURATIONS = TREE / "tests" / "durations.json"
 QUIET_S = 600
 """Longest that a step may print nothing on a machine with nothing else to do [s]; a hang ends with a name."""
+SLOW_S = 600
+"""Longest that a test may take which gives way to others; alone it is that of pyproject.toml [s]."""
 # Tests of real processes mostly wait: two files of them run at a time, and what they promise holds on a busy machine.
 # All others compute, one for each processor, on the time that those leave.
 # Those that measure share the processors with nothing.
@@ -58,7 +60,7 @@ def pytest(cache: str, *arguments: str) -> list[str]:
 
 
 def computing(*paths: str) -> Step:
-    return "tests that compute, in parallel", pytest("computing", *TWO_FILES, *paths)
+    return "tests that compute, in parallel", pytest("computing", *TWO_FILES, f"--timeout={SLOW_S}", *paths)
 
 
 def of_processes(*paths: str) -> Step:
@@ -154,7 +156,8 @@ def is_pytest(step: Step) -> bool:
 
 
 def without_workers(command: list[str]) -> list[str]:
-    """Return a command of pytest that runs in one process."""
+    """Return a command of pytest that runs in one process, and beside nothing."""
+    command = [word for word in command if not word.startswith("--timeout=")]
     for option in ("-n", "--dist"):
         at = command.index(option) if option in command else len(command)
         command = command[:at] + command[at + 2 :]

@@ -40,7 +40,7 @@ def test_what_failed_is_run_once_more_and_a_second_failure_counts(monkeypatch: A
         return next(codes)
 
     monkeypatch.setattr(suite, "run_step", step)
-    timed = ("timed", ["python", "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "tests"])
+    timed = ("timed", ["python", "-m", "pytest", "-q", "-n", "2", "--dist", "loadfile", "--timeout=600", "tests"])
     codes = iter([1, 0])
     assert suite.run_steps([timed]) == 0
     assert ran[1] == ["python", "-m", "pytest", "-q", "tests", "--lf", "--lfnf=none"]
