@@ -36,7 +36,7 @@ def test_what_is_written_is_what_was_made() -> None:
     tables = slowed(_tables(), 0.25, ETC)
     assert tomllib.loads(toml(tables)) == tables
     assert Path(tables["device"]["touch1"]["shape"]["finger_file"]).is_absolute()
-    assert tables["device"]["hand"]["pace"] == 0.25
+    assert tables["device"]["hand"]["pace"] == 0.25 and tables["device"]["left"]["world_age_max_s"] == 0.2
 
 
 def test_one_pace_goes_on_top_of_another() -> None:
