@@ -274,7 +274,7 @@ def _ready(cell: Any, home: list[float]) -> None:
             cell.reset()
             with cell.open("hand", "rw", 10.0) as hand:
                 home[:] = home or list(hand.read().position)
-                hand.write([command(axis, position=to, time=0.1 / PACE) for axis, to in enumerate(home)])
+                hand.write([command(axis, position=to, time=0.3 / PACE) for axis, to in enumerate(home)])
                 hand.wait_until_idle(30.0)
         except OSError as error:  # something is latched still, or again
             why[0] = str(error)
