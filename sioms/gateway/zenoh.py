@@ -11,13 +11,11 @@ from __future__ import annotations
 
 import errno
 import os
-import queue
 import re
 import socket
 import threading
 import traceback
 from collections import Counter, deque
-from collections.abc import Iterator
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
@@ -32,6 +30,7 @@ from sioms.protocol import link
 from sioms.protocol.link import Down, MalformedFrame
 from sioms.protocol.messages import MalformedMessage
 
+from .stop_queue import StopQueue
 from .ways import Ways
 
 if TYPE_CHECKING:
@@ -41,8 +40,6 @@ TURN = 200
 """Frames of clients that are taken before others have their turn."""
 MOST_QUEUED = 1000
 """Frames of the holder of a certificate that wait to be taken; what comes above is dropped, which ends its session."""
-MOST_STOPS = 64
-"""The same for stops."""
 _NAME = re.compile(r"sioms/[a-z]+/(cert-0[0-9]{3})/([0-9a-f]{16})")
 
 
@@ -119,7 +116,7 @@ class Zenoh:
         self._publishers: dict[bytes, zenoh.Publisher] = {}
         self._came = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         loop.add(self._came, self._heard)
-        self._stops: queue.SimpleQueue[tuple[str, str, bytes] | None] = queue.SimpleQueue()
+        self._stops = StopQueue()
         self._ways = Ways(path)
         self._thread = threading.Thread(target=self._run_stops, name="stops over Zenoh", daemon=True)
         limit = {
@@ -174,8 +171,8 @@ class Zenoh:
 
     def _stop(self, sample: zenoh.Sample) -> None:
         found = _NAME.fullmatch(str(sample.key_expr))
-        if found and sample.kind == zenoh.SampleKind.PUT and self._stops.qsize() < MOST_STOPS:
-            self._stops.put((found[1], found[2], sample.payload.to_bytes()))
+        if found and sample.kind == zenoh.SampleKind.PUT:
+            self._stops.put(found[1], found[2], sample.payload.to_bytes())
 
     # --- the loop --------------------------------------------------------------------------------
 
@@ -239,13 +236,9 @@ class Zenoh:
 
     # --- stops -----------------------------------------------------------------------------------
 
-    def _asked(self) -> Iterator[tuple[str, str, bytes]]:
-        while (asked := self._stops.get()) is not None:
-            yield asked
-
     def _run_stops(self) -> None:
         be_prompt()
-        for number, name, frame in self._asked():
+        for number, name, frame in self._stops:
             try:
                 who = self._loop.principal(number)
                 answer = self._ways.answer(who, self._host(number), frame) if who else None
@@ -263,7 +256,7 @@ class Zenoh:
 
     def close(self) -> None:
         """Let go of everything."""
-        self._stops.put(None)
+        self._stops.close()
         self._thread.join(2.0)
         self._session.close()  # type: ignore[no-untyped-call]
         self._loop.remove(self._came)
