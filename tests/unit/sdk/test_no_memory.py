@@ -19,6 +19,7 @@ from own_writes_rig import Device, OnLine, World, worlds
 
 from sioms.client.command import command
 from sioms.drivers.sim.axes import SimAxes
+from sioms.sdk.failing import free_reserve
 
 _testcapi: Any = pytest.importorskip("_testcapi", reason="this interpreter cannot be made to run out of memory")
 
@@ -95,21 +96,49 @@ def test_wherever_an_allocation_fails_a_driver_goes_on_or_halts(kind: str) -> No
     assert found.count("failed and halted") > 3, "else nothing has been tried"
 
 
+def take_all() -> list[bytes]:
+    """Let this process have no more memory, of any size."""
+    size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (size, resource.RLIM_INFINITY))
+    taken: list[bytes] = []
+    for each in (1 << 20, 1 << 16, 1 << 12, 400, 200, 100, 50, 16):
+        try:
+            while True:
+                taken.append(bytes(each))
+        except MemoryError:
+            continue
+    return taken
+
+
+def free_and_take() -> str:
+    """Return whether there is memory once what is kept for failing has been freed, and none before."""
+    taken = take_all()
+    before = _can_have(1 << 20)
+    free_reserve()
+    after = _can_have(1 << 20)
+    taken.clear()
+    return f"before {before}, after {after}"
+
+
+def _can_have(size: int) -> bool:
+    try:
+        bytes(size)
+    except MemoryError:
+        return False
+    return True
+
+
+def test_what_is_kept_for_failing_is_there_when_nothing_else_is() -> None:
+    assert in_a_process(free_and_take) == "before False, after True"
+
+
 def fail_without_memory(kind: str) -> str:
     """Let a driver fail in a process that gets no more memory, of any size; return what became of it."""
     with worlds() as make:
         world = moving(kind, make)
         runtime = world.runtime
         runtime._run_line = lambda: [world._line() for _ in range(60)]  # type: ignore[method-assign]
-        size = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-        resource.setrlimit(resource.RLIMIT_AS, (size, resource.RLIM_INFINITY))
-        taken: list[Any] = []
-        for each in (1 << 20, 1 << 16, 1 << 12, 400, 200, 100, 50, 16):
-            try:
-                while True:
-                    taken.append(bytes(each))
-            except MemoryError:
-                continue
+        taken = take_all()
         runtime.fail(MemoryError())
         told = is_moving(world)
         taken.clear()
