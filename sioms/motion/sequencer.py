@@ -41,18 +41,9 @@ instants.
 SPARE_SHARE, BEGIN_S = 0.05, 50e-6
 """Share of the period, and what beginning a command takes of it [s]: how many may follow short ones on axes at rest."""
 
-_KIND_STATUS = np.array(
-    [
-        0,
-        AxisStatus.MOVING,
-        AxisStatus.MOVING,
-        AxisStatus.MOVING | AxisStatus.FORCE_MODE,
-        AxisStatus.MOVING,
-        AxisStatus.MOVING | AxisStatus.STOPPING,
-        AxisStatus.MOVING,
-    ],
-    dtype=np.int64,
-)
+_MOVING = AxisStatus.MOVING
+_FORCE, _STOPPING = _MOVING | AxisStatus.FORCE_MODE, _MOVING | AxisStatus.STOPPING
+_KIND_STATUS = np.array([0, _MOVING, _MOVING, _FORCE, _MOVING, _STOPPING, _MOVING], dtype=np.int64)
 _HOMING = int(AxisStatus.HOMING)
 
 
@@ -448,21 +439,14 @@ class Sequencer:
             return
         law, mode = self._law, command.control_mode
         if mode & modes.GAINS:
-            law.k[axis], law.kz[axis], law.kp[axis], law.kb[axis] = (
-                command.k,
-                command.kz,
-                command.kp,
-                command.kb,
-            )
+            law.k[axis], law.kz[axis], law.kp[axis], law.kb[axis] = command.k, command.kz, command.kp, command.kb
         if mode & modes.FORCE_OFFSET:
             law.offset[axis] = command.force_offset
         if mode & modes.MAX_FORCE:
             law.limit_force(np.array([axis]), command.max_force)
         if mode & modes.MAX_VEL_ACC:
-            self._velocity_limit[axis], self._acceleration_limit[axis] = (
-                command.max_velocity,
-                command.max_acceleration,
-            )
+            self._velocity_limit[axis] = command.max_velocity
+            self._acceleration_limit[axis] = command.max_acceleration
 
     def _rest(self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
         """Nothing follows: hold the axes at rest, brake the others."""
