@@ -128,28 +128,30 @@ ACTS: dict[str, Act] = {
 
 def bench_blackbox(options: Options, report: Report) -> None:
     """Have things go wrong in turn, and count the causes that are named rightly."""
-    trials, dice = options.kills(8, 100), random.Random(options.seed)
     wall = axes("mod1", 2, limits=False, axis_keys="following_error_max = 0.004").replace("encoder_step = 1e-6", WALL)
     right = dict.fromkeys(ACTS, 0)
     tried = dict.fromkeys(ACTS, 0)
     with Daemon(workcell([axes("mod0", 2, limits=False), wall])) as daemon:
-        scene = _Scene(daemon, dice)
-        for trial in range(trials):
-            what = list(ACTS)[trial % len(ACTS)]
-            expected, story = _trial(scene, ACTS[what])
-            tried[what] += 1
-            cause, *words = expected
-            if story is not None and story.cause == cause and all(word in story.text for word in words):
-                right[what] += 1
-            else:
-                told = f"{story.cause}: {story.text}" if story else "no box was written"
-                report.note(f"{what}: {told}; want {cause} with {', '.join(words)}"[:400])
-            report.progress(f"black box: {trial} of {trials}")
-    for what in ACTS:
-        if tried[what]:
-            notes = f"of {tried[what]}"
-            wrong = tried[what] - right[what]
-            report.value(f"causes not named rightly: {what}", wrong, bars=[Bar("value", 0)], notes=notes)
+        scene, trials = _Scene(daemon, random.Random(options.seed)), options.kills(8, 100)
+        try:
+            for trial in range(trials):
+                what = list(ACTS)[trial % len(ACTS)]
+                right[what] += _is_right(scene, what, report)
+                tried[what] += 1
+                report.progress(f"black box: {trial} of {trials}")
+        finally:
+            for what in filter(tried.__getitem__, ACTS):
+                wrong, notes = tried[what] - right[what], f"of {tried[what]}"
+                report.value(f"causes not named rightly: {what}", wrong, bars=[Bar("value", 0)], notes=notes)
+
+
+def _is_right(scene: _Scene, what: str, report: Report) -> bool:
+    (cause, *words), story = _trial(scene, ACTS[what])
+    if story is not None and story.cause == cause and all(word in story.text for word in words):
+        return True
+    told = f"{story.cause}: {story.text}" if story else "no box was written"
+    report.note(f"{what}: {told}; want {cause} with {', '.join(words)}"[:400])
+    return False
 
 
 def _trial(scene: _Scene, act: Act) -> tuple[tuple[str, ...], Story | None]:

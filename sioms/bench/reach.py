@@ -41,7 +41,7 @@ while True:
 """
 _CRUISE = """
 import sys, time, sioms
-node = sioms.Workcell(sys.argv[1], "cruiser").open("mod0", "rw", 10.0)
+node = sioms.Workcell(sys.argv[1], "cruiser").open("mod0", "rw", 10.0, lease=float(sys.argv[3]))
 node.write([sioms.command(axis, velocity=float(sys.argv[2])) for axis in range(len(node.info.channels))])
 print("ready", flush=True)
 while True:
@@ -234,10 +234,10 @@ def _pull_once(daemon: Daemon, kind: type[Gateway]) -> int:
                 victim.wait()
 
 
-def cruiser(address: str) -> subprocess.Popen[str]:
-    """Start a client that moves axes."""
+def cruiser(address: str, lease_s: float = 0.0) -> subprocess.Popen[str]:
+    """Start a client that moves axes; a lease of 0 is the usual one."""
     return subprocess.Popen(
-        [sys.executable, "-P", "-c", _CRUISE, address, str(SPEED)], stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-P", "-c", _CRUISE, address, str(SPEED), str(lease_s)], stdout=subprocess.PIPE, text=True,
         stderr=subprocess.DEVNULL, preexec_fn=ends_with_us(),
     )  # fmt: skip
 
