@@ -7,7 +7,7 @@ import os
 from ownership_bits import Tour, bit_cell, explore
 
 STEPS = int(os.environ.get("SIOMS_BIT_STEPS", "1000"))
-"""Of 54,540; all of them take two minutes: ``python tests/ownership_bits.py``."""
+"""Of 54,540; ``python tests/ownership_bits.py`` goes on."""
 
 
 def test_no_promise_is_broken_in_any_state_and_the_real_objects_are_in_the_same() -> None:
