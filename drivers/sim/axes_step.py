@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 from sioms.motion.axis_step import ENDS, LATE, NOT_FINITE, ODD, WIDE, Loop, quiet_tick
-from sioms.motion.stop_step import Stopping, rest_stopped, stop_axes
+from sioms.motion.stop_step import Stopping, go_on, rest_stopped, stop_axes
 from sioms.native.language import Floats, Integers, Record, step
 from sioms.native.system import clock_ns
 from sioms.plant.binary_step import Beams, look
@@ -130,7 +130,7 @@ def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int, beside_ns: int) -> int:
     while s.ahead < ticks:
         if move_axes(s):
             return NOT_READY
-    if s.stopping.braked_ns and rest_stopped(s.stopping, now_ns):
+    if rest_stopped(s.stopping, now_ns) if s.stopping.braked_ns else go_on(s.stopping, now_ns):
         return ENDS
     loop = s.loop
     m = s.motors

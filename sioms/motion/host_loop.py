@@ -329,6 +329,8 @@ class AxisBank(Bank):
         if self._last_ns != self.loop.last_ns:
             self._last_ns = self.loop.last_ns
             self._sequencer.begin_tick(self.loop.dt)
+        if self.loop.next_ns != self._sequencer.store.next_ns:  # segments have ended
+            self._sequencer.store.look_ahead()
         if self.stopping.braked_ns and self._braked.any():
             self._braked_ns = self.stopping.braked_ns
             self._sequencer.after_stop()

@@ -1,4 +1,5 @@
-"""The beginning of an emergency stop of axes whose loop the host closes, without what follows from it.
+"""What becomes of plans where nothing is decided: the segments that follow, and the beginning of an emergency stop of
+axes whose loop the host closes, without what follows from it.
 
 ``Sequencer.halt`` does the same for axes in any state; here are those states in which no decision is left. Axes are
 latched with their brakes, so no reading shows one without the other. What is dropped and told is the bank's, which does
@@ -137,6 +138,54 @@ def brake(s: Stopping, i: int, now_ns: int) -> int:
     a.segment_ns[i] = now_ns
     s.end_ns[i] = now_ns + int(-whole(-duration * 1e9))
     a.next_ns = min(a.next_ns, s.end_ns[i])
+    return 0
+
+
+@step
+def go_on(s: Stopping, now_ns: int) -> int:
+    """Begin the segments that follow within plans. Returns 1, and nothing is done, where a plan ends by now."""
+    a = s.loop
+    if now_ns < a.next_ns:
+        return 0
+    for i in range(a.n):
+        if s.end_ns[i] <= now_ns and plan_ends(s, i, now_ns):
+            return 1
+    next_ns = NEVER_NS
+    for i in range(a.n):
+        while s.end_ns[i] <= now_ns:
+            a.segment_ns[i] = s.end_ns[i]
+            s.segment[i] += 1
+            load(s, i)
+        next_ns = min(next_ns, s.end_ns[i])
+    a.next_ns = next_ns
+    return 0
+
+
+@step
+def plan_ends(s: Stopping, i: int, now_ns: int) -> int:
+    """Return whether the plan of an axis ends by now, of its own or because it is cut."""
+    row = s.row[i]
+    last = s.count[row] - 1
+    return s.cut_ns[i] <= now_ns or segment_end(s, i, row * MAX_SEGMENTS + last) <= now_ns
+
+
+@step
+def segment_end(s: Stopping, i: int, place: int) -> int:
+    """Return the instant at which a segment ends, as ``PlanStore`` rounds it."""
+    end = s.ends[place] * 1e9 + s.start_fraction[i]
+    if end >= NEVER_NS:
+        return NEVER_NS
+    return min(s.start_ns[i] + int(-whole(-end)), NEVER_NS)
+
+
+@step
+def load(s: Stopping, i: int) -> int:
+    """Take the coefficients and the end of the present segment of an axis."""
+    a = s.loop
+    place = s.row[i] * MAX_SEGMENTS + s.segment[i]
+    for j in range(PIECE):
+        a.present[j * a.n + i] = s.coefficients[place * PIECE + j]
+    s.end_ns[i] = min(segment_end(s, i, place), s.cut_ns[i])
     return 0
 
 

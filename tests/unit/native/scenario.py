@@ -5,7 +5,7 @@ import hashlib
 import numpy as np
 
 from sioms.motion import AxisBank, AxisKind, AxisSettings, CommandError, Homing
-from sioms.motion.stop_step import rest_stopped, stop_axes
+from sioms.motion.stop_step import go_on, rest_stopped, stop_axes
 from sioms.native import language
 from sioms.plant.effects import build_effects
 from sioms.plant.motor import MotorBank
@@ -54,13 +54,15 @@ def main():
     coils = [Stepper(0.1, 1e-3, hold_force=5.0, coulomb=0.2), Stepper(0.02, 2e-3, hold_force=1.0, encoder_step=1e-5)]
     rotors = [StepperBank(coils, 1e-3) for _ in plants]
     banks = [AxisBank(settings, tick_s=1e-3, markers=NoMarkers()) for _ in plants]
-    now, digest, refused, braked = 1_000_000_000, hashlib.sha256(), 0, 0
+    now, digest, refused, braked, left = 1_000_000_000, hashlib.sha256(), 0, 0, 0
     reading, switches = np.zeros(5), np.zeros(5, dtype=np.int64)
     for tick in range(6000):
         now += 1_000_000 if rng.random() < 0.98 else int(rng.integers(200_000, 3_000_000))
         for bank, plant, rotor in zip(banks, plants, rotors, strict=True):
             reading[:3], reading[3:] = plant.encoder.position, rotor.reading
             switches[:3] = plant.switches
+            if tick % 3 and bank.is_quiet():
+                left += go_on(bank.stopping, now)
             out = bank.tick(now, reading, switches if tick % 3 else None)
             plant.advance(out[:3])
             rotor.advance(out[3:] if tick < 4000 else out[3:] * 1.5)
@@ -90,7 +92,7 @@ def main():
                 bank.reset(range(5))
     assert braked > 25, "most stops are begun by steps"
     kinds = sorted({event.kind.name for bank in banks for event in bank.take_events()})
-    print("compiled" if language.library else "python", digest.hexdigest(), refused, *kinds)
+    print("compiled" if language.library else "python", digest.hexdigest(), refused + left, *kinds)
 
 
 if __name__ == "__main__":
