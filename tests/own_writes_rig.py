@@ -326,6 +326,9 @@ def own_time(world: list[World]) -> Iterator[None]:
         world[0].turn()
 
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shown, "_nodes", {})
+        patch.setattr(shown, "_last_ns", {})
+        patch.setattr(shown, "_everywhere_ns", 0)  # what this process has been told in the system's time is not owed
         patch.setattr(time, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "sleep", sleep)

@@ -339,6 +339,14 @@ def test_zero_gains_and_tare_of_sensors(make_world: Any, kind: str) -> None:
     _play(world, promises, [one.node, eye.node], [zero, tare if pushes else gains], STEPS // 2)
 
 
+def test_what_the_process_was_told_in_the_systems_time_is_not_owed_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Behind a test of a real daemon, whose time is far ahead of the rig's, a reading waited for ever."""
+    monkeypatch.setattr(shown, "_everywhere_ns", 1 << 62)
+    with worlds() as make:
+        world = make(SimIo, {"outputs": 8, "safe": 0}, 12)
+        assert world.open(0, [0], exclusive=True).node.owed_ns <= time.monotonic_ns()
+
+
 def test_a_line_that_is_lost_while_a_reading_waits(make_world: Any) -> None:
     """The reading that waits for the publication gets the error that any reading gets then."""
     device = Device(random.Random(8))
