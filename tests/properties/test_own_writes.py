@@ -163,7 +163,8 @@ def _axis_acts(
 
     def await_marker() -> None:
         state = promises.withdraw("motion", "queue", "gate", "place", "gains")
-        marker, key = chance.randrange(1, 1000), next(unique)
+        key = next(unique)
+        marker = 1 + key % 999  # the daemon reserves none twice that somebody waits for: its wait would end
         markers.append((marker, world.markers.reserve(marker, key)))
         token = token_of(marker, key)
         done = promises.make(state, "wait for marker", queue=lambda s: s.buffered[0] >= 1)
