@@ -32,6 +32,10 @@ from .rigs import Axis, Output, Rig
 ANSWER_S = 5.0
 START_S = 30.0
 UP_S = 15.0
+STILL_S = 5.0
+"""Longest time until an axis rests after a trial [s]."""
+MOVED_S = 0.05
+"""In which an axis that goes on at its rig's speed leaves its tolerance, twice over at least [s]."""
 LOGGED_S = 1.0
 """Longest time until the daemon has written down what a driver has told it; the node shows it at once [s]."""
 PRIORITY = 15
@@ -390,7 +394,12 @@ class Station:
         ]
 
     def settle(self) -> None:
-        """Bring all back to calm: no faults, no stop, link good, axes at rest."""
+        """Bring all back to calm: no faults, no stop, link good, axes at rest.
+
+        Raises:
+            RuntimeError: an axis goes on; its device is of no use for another trial.
+            OSError: as wait_good.
+        """
         if self.wires:
             self.fault()
             self.tell_wire("plug")
@@ -403,6 +412,8 @@ class Station:
             with contextlib.suppress(OSError), self.cell.open(axis.node, "rw", timeout=2.0) as node:
                 node.reset()
                 _wait_sound(node)
+            with self.cell.open(f"{axis.node}{READONLY}") as seen:
+                _wait_still(seen, axis)
         self._log_of_before = len(self.daemon.log()) if self.daemon is not None else 0
 
     def start_client(self, script: str, *words: str) -> Client:
@@ -422,6 +433,22 @@ def _crash(log: str) -> str:
 def _wait_sound(node: Any) -> None:
     """Wait until a reset has taken effect."""
     wait_for(lambda: not node.read().status[0] & AxisStatus.FAULT, 2.0)
+
+
+def _wait_still(seen: Any, axis: Axis) -> None:
+    """Wait until an axis rests in the place where its device says it is."""
+
+    def rests() -> bool:
+        first = last = seen.read()
+        while last.stamp_ns < first.stamp_ns + MOVED_S * 1e9:  # a device may be polled as seldom
+            time.sleep(MOVED_S / 10)
+            last = seen.read()
+        return not last.in_motion[0] and abs(last.position[0] - first.position[0]) <= axis.tolerance
+
+    if not wait_for(rests, STILL_S):
+        reading = seen.read()
+        told = f"in_motion {reading.in_motion[0]}, position {reading.position[0]:.6g}"
+        raise RuntimeError(f"{axis.node} does not come to rest within {STILL_S:g} s after the trial: {told}")
 
 
 def _is_same(name: str, names: set[str]) -> bool:

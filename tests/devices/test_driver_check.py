@@ -102,6 +102,19 @@ def test_a_trial_whose_device_faults_by_itself_is_tried_again_and_says_so(times:
     assert "alarm 0x85" in result.seen and "oriental_az in fault at" in result.seen
 
 
+def test_a_device_that_goes_on_after_a_trial_is_not_used_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next trial met the fault that the motion led to, and not what it was to find."""
+    monkeypatch.setattr("sioms.check.station.STILL_S", 0.5)
+    (rig,) = (rig for rig in MAP_RIGS if rig.title == "oriental_az")
+    with Station(rig, wired=False) as station:
+        assert station.simulator is not None
+        station.simulator.tell("shove 2000")
+        with pytest.raises(RuntimeError, match="does not come to rest"):
+            station.settle()
+        station.simulator.tell("shove 0")
+        station.settle()
+
+
 def test_a_report_is_a_page(tmp_path: Path) -> None:
     page = tmp_path / "report.html"
     status, _, said = run(str(AUTHORS / "brittle.py"), "--only", "golden", "--report", str(page))
