@@ -56,9 +56,7 @@ class LoadingAxis:
 
     def tare(self) -> None:
         """Take the force that is there for none."""
-        number = self.force.read().number
-        self.watch_for(TARED)
-        self.tare_n = float(np.mean([s.measured() for s in self.force.history(number)]))
+        self.tare_n = float(np.mean([s.measured() for s in self.watch_for(TARED)]))
 
     def learn(self) -> None:
         """Feel for the surface and learn how far the axis must go for a force; it must be clear, and tared.
@@ -76,9 +74,7 @@ class LoadingAxis:
         # a force lags behind a motion: a press at rest sets the scale
         half = 0.5 * self.most_n
         self.press(half)
-        number = self.force.read().number
-        self.watch_for(TARED)
-        at_rest = self.net(self.force.history(number))
+        at_rest = self.net(self.watch_for(TARED))
         self.clear()
         self._ways[self._way] = position, force * (at_rest / half)
 
@@ -123,14 +119,22 @@ class LoadingAxis:
                 if time.monotonic() > deadline:
                     raise ExperimentStopped(f"move {node.name} to {position:.4g}: not there within {MOVE_S:g} s")
 
-    def watch_for(self, samples: int) -> None:
-        """Wait for so many samples of the force, watching it."""
-        wanted, deadline = self.force.read().number + samples, time.monotonic() + MOVE_S
-        while self.force.read().number < wanted:
+    def watch_for(self, samples: int) -> list[Any]:
+        """Wait for so many samples of the force as it is from now on, watching it; return them.
+
+        What a busy device or line brings late was felt before the move that led here.
+        """
+        begin_ns, last = time.monotonic_ns(), self.force.read().number
+        deadline, seen = time.monotonic() + MOVE_S, []
+        while len(seen) < samples:
             if time.monotonic() > deadline:
                 raise ExperimentStopped(f"read {self.force.name}: no {samples} samples within {MOVE_S:g} s")
             time.sleep(POLL_S)
             self.check()
+            news = self.force.history(last)
+            last = news[-1].number if news else last
+            seen += [one for one in news if one.stamp_ns >= begin_ns]
+        return seen
 
     def keep_alive(self) -> None:
         """Say that this program is alive."""

@@ -278,13 +278,14 @@ class Bench:
         """Keep the rows of one load."""
         wrench = np.array(push.wrench)
         for _ in range(ROWS):
-            last = sensor.read().number
+            begin_ns, last = time.monotonic_ns(), sensor.read().number
             seen: list[Any] = []
             load()
             while len(seen) < SAMPLES:
                 sensor.wait_new(last, 2.0)
-                seen += sensor.history(last)
-                last = seen[-1].number
+                new = sensor.history(last)
+                last = new[-1].number
+                seen += [one for one in new if one.stamp_ns >= begin_ns]  # what comes late was felt before
                 check()
             if any(flag & (AnalogStatus.SATURATED | AnalogStatus.INVALID) for s in seen for flag in s.flags):
                 raise ExperimentStopped(f"load {sensor.name}: it is saturated, or reads nothing, during {push.name}")
@@ -310,11 +311,13 @@ class Bench:
 
 def _told(loading: LoadingAxis) -> Callable[[], float]:
     """Return what tells the mean force [N] since it was asked last."""
-    seen = [loading.force.read()]
+    asked_ns, last = time.monotonic_ns(), loading.force.read()
 
     def told() -> float:
-        nonlocal seen
-        seen = loading.force.history(seen[-1].number) or seen[-1:]  # a slow one may have nothing new
-        return loading.net(seen)
+        nonlocal asked_ns, last
+        seen = loading.force.history(last.number) or [last]  # a slow one may have nothing new
+        since = [one for one in seen if one.stamp_ns >= asked_ns] or seen[-1:]
+        asked_ns, last = time.monotonic_ns(), seen[-1]
+        return loading.net(since)
 
     return told

@@ -81,3 +81,21 @@ def test_a_move_under_guard_stops_with_the_error_and_one_that_lets_go_needs_no_f
     wall.axis.read = lambda: _stamped(snapshot(NodeClass.AXIS, 1, in_motion=[next(ends)]), 1)
     loading.move(wall.axis, 0.0, guarded=False)
     assert wall.stopped == 1
+
+
+def test_a_tare_takes_nothing_that_was_felt_before_it_and_comes_late() -> None:
+    """On a busy machine the samples of the touch before came behind the move away from it, and were taken for rest."""
+    wall, late = Wall({}), iter(range(1, 1 << 30))
+    begin_ns = time.monotonic_ns()
+
+    def history(after: int) -> list[Any]:
+        """Give 40 samples of 8 N from before, then samples of 1 N of now."""
+        old = next(late) <= 40
+        stamp_ns = begin_ns - 1_000_000 if old else time.monotonic_ns()
+        return [_stamped(snapshot(NodeClass.ANALOG, 1, data=[8.0 if old else 1.0]), stamp_ns)]
+
+    wall.force.history = history
+    loading = LoadingAxis(wall.axis, wall.force, 10.0, 0.01)
+    wall.axis.read = lambda: _stamped(snapshot(NodeClass.AXIS, 1), 1)
+    loading.tare()
+    assert loading.tare_n == 1.0
