@@ -9,31 +9,56 @@ import errno
 import math
 from collections.abc import Callable
 
+MOST, LARGEST = 2**31 - 1, 1e15
+"""What is larger, a count or a number, is a slip."""
 
-def whole(least: int = 0) -> Callable[[str], int]:
-    """Return what reads a whole number of so much at least."""
+
+def whole(least: int = 0, most: int = MOST) -> Callable[[str], int]:
+    """Return what reads a whole number within bounds."""
 
     def read(text: str) -> int:
         try:
             value = int(text)
         except ValueError:
             value = least - 1
-        if value < least:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {least} on")
+        if not least <= value <= most:
+            to = f"to {most}" if value > most else "on"
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {least} {to}")
         return value
 
     return read
 
 
 def positive(text: str) -> float:
-    """Read a finite number above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0.0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number above 0")
+    """Read a number above 0, of any sensible size."""
+    value = _number(text)
+    if not 0.0 < value <= LARGEST:
+        to = f" up to {LARGEST:g}" if value > LARGEST else ""
+        raise argparse.ArgumentTypeError(f"{text!r} is no number above 0{to}")
     return value
+
+
+def not_negative(text: str) -> float:
+    """Read a number from 0 on, of any sensible size."""
+    value = _number(text)
+    if not 0.0 <= value <= LARGEST:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to {LARGEST:g}")
+    return value
+
+
+def radius(text: str) -> float:
+    """Read a radius: 0 is an edge, inf a flat."""
+    value = _number(text)
+    if not (0.0 <= value <= LARGEST or value == math.inf):
+        raise argparse.ArgumentTypeError(f"{text!r} is no radius; want a number from 0 on, or inf")
+    return value
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 LONGEST_S = 1e9
@@ -42,10 +67,7 @@ LONGEST_S = 1e9
 
 def seconds(text: str) -> float:
     """Read a time of either sign [s]."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
+    value = _number(text)
     if not abs(value) <= LONGEST_S:
         raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds, of {LONGEST_S:g} s at most")
     return value

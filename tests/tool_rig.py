@@ -1,15 +1,18 @@
-"""Rig for tests of the tools: snapshots and node information made by hand, out of the real classes."""
+"""Rig for tests of the tools: snapshots and node information made by hand, out of the real classes; all parsers."""
 
 from __future__ import annotations
 
+import argparse
 import struct
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 from sioms.client.snapshot import SNAPSHOT, Layout
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.protocol.records import READ
+from sioms.tools.front import installed
 
 AXES = ("xaxis", "yaxis", "zaxis", "taxis")
 
@@ -28,3 +31,21 @@ def snapshot(node_class: NodeClass, count: int, **fields: Sequence[float]) -> An
     for name, column in READ[node_class].items():
         raw += struct.pack(f"<{count}{column.code}", *fields.get(name, [0] * count))
     return SNAPSHOT[node_class](raw, Layout(node_class, count, list(range(count)), -1))
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """Return the parsers of all commands and actions by their words."""
+    found: dict[str, argparse.ArgumentParser] = {}
+
+    def walk(parser: argparse.ArgumentParser, words: str) -> None:
+        for action in parser._actions:
+            if isinstance(action, argparse._SubParsersAction):
+                for name, inner in action.choices.items():
+                    found[f"{words} {name}".strip()] = inner
+                    walk(inner, f"{words} {name}".strip())
+
+    for module in {command.module for command in installed().values()}:
+        parser = argparse.ArgumentParser()
+        import_module(module).add_parser(parser.add_subparsers())
+        walk(parser, "")
+    return found

@@ -9,7 +9,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from sioms.arguments import positive
+from sioms.arguments import positive, whole
 
 from .cell import print_json, table
 
@@ -42,7 +42,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument("--config", metavar="FILE", type=Path, help="TOML of the device; {port} stands for its port")
     one.add_argument("--report", metavar="FILE", type=Path, help="write the report, as HTML when it ends in .html")
     one.add_argument("--json", metavar="FILE", type=Path, help="write all results as JSON")
-    one.add_argument("-j", "--jobs", metavar="N", type=int, default=1, help="drivers checked at the same time")
+    one.add_argument("-j", "--jobs", metavar="N", type=whole(1), default=1, help="drivers checked at the same time")
     one = actions.add_parser("trace", help="record the traffic on a device's line")
     one.add_argument("config", metavar="CONFIG", type=Path, help="configuration (TOML)")
     one.add_argument("device", metavar="DEVICE", help="name of the device in it")

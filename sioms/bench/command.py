@@ -8,6 +8,8 @@ import signal
 import sys
 from typing import Any
 
+from sioms.arguments import whole
+
 from .figures import Report
 from .options import Options
 from .tables import markdown
@@ -92,17 +94,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.description = f"Measure the guarantees of SIOMS on this machine.\n\nsub-benches:\n{names}"
     parser.add_argument("names", nargs="*", metavar="NAME", help="sub-benches to run; all when none is named")
     parser.add_argument("--quick", action="store_true", help="fewer trials: seconds instead of minutes")
-    parser.add_argument("--trials", type=int, metavar="N", help="trials of each kill, hang and stop")
-    parser.add_argument("--soak", type=int, metavar="N", help="opens and closes of the sub-bench open")
-    parser.add_argument("--frames", type=int, metavar="N", help="frames of the sub-bench fuzz")
-    parser.add_argument("--files", type=int, metavar="N", help="files of the sub-bench fuzz")
+    parser.add_argument("--trials", type=whole(1), metavar="N", help="trials of each kill, hang and stop")
+    parser.add_argument("--soak", type=whole(1), metavar="N", help="opens and closes of the sub-bench open")
+    parser.add_argument("--frames", type=whole(1), metavar="N", help="frames of the sub-bench fuzz")
+    parser.add_argument("--files", type=whole(1), metavar="N", help="files of the sub-bench fuzz")
     parser.add_argument(
         "--target",
         action="append",
         metavar="NAME",
         help="target of the sub-bench fuzz; all when none is named",
     )
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="of random frames")
+    parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="of random frames")
     parser.add_argument(
         "--picture",
         metavar="FILE",

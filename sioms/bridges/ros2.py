@@ -84,8 +84,9 @@ def connect(router: str) -> zenoh.Session:
     try:
         return zenoh.open(zenoh.Config.from_json5(json.dumps(table)))
     except zenoh.ZError as error:
+        why = str(error).partition(" at /")[0]  # behind it is where in the library's code
         text = (
-            f"connect to the router of Zenoh at {printable(router)}: {error}; start `ros2 run rmw_zenoh_cpp rmw_zenohd`"
+            f"connect to the router of Zenoh at {printable(router)}: {why}; start `ros2 run rmw_zenoh_cpp rmw_zenohd`"
         )
         raise OSError(errno.ECONNREFUSED, text) from None
 

@@ -13,6 +13,9 @@ from sioms.arguments import whole
 from sioms.client.keys import Folder
 from sioms.documents import json_text
 
+LONGEST_DAYS = 36_500
+"""Of a certificate: a hundred years."""
+
 
 def add_parser(subparsers: Any) -> None:
     """Add ``cert`` to the subcommands of ``sioms``."""
@@ -25,7 +28,7 @@ def add_parser(subparsers: Any) -> None:
     verbs = cert.add_subparsers(dest="verb", required=True, metavar="VERB")
     authority = verbs.add_parser("authority", help="create the authority of a fleet on this machine")
     authority.add_argument("name", nargs="?", default="fleet", help="default: fleet")
-    authority.add_argument("--days", type=whole(1), default=3650, help="how long it holds; default 3650")
+    authority.add_argument("--days", type=whole(1, LONGEST_DAYS), default=3650, help="how long it holds; default 3650")
     request = verbs.add_parser("request", help="create your own key, and print a certificate request")
     request.add_argument("name", nargs="?", default="", help="default: the user's name; of a gateway that of the cell")
     sign = verbs.add_parser("sign", help="sign a request, and print the certificate")
@@ -33,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
     sign.add_argument(
         "--host", action="append", default=[], help="a gateway's: name or address it is reached by; again for more"
     )
-    sign.add_argument("--days", type=whole(1), default=365, help="how long it holds; default 365")
+    sign.add_argument("--days", type=whole(1, LONGEST_DAYS), default=365, help="how long it holds; default 365")
     install = verbs.add_parser("install", help="install your own signed certificate")
     install.add_argument("file", help="what `sioms cert sign` has printed; - for standard input")
     listing = verbs.add_parser("list", help="list your own certificate, and those signed by this machine's authority")

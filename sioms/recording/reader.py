@@ -6,7 +6,9 @@ is not. It is read and not mapped: a mapped file that is cut off meanwhile would
 
 from __future__ import annotations
 
+import errno
 import os
+import stat
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -152,9 +154,12 @@ class Recording:
         # A pipe would hold up who opens it.
         self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
         try:
-            self.size = os.fstat(self._fd).st_size
+            what = os.fstat(self._fd)
+            self.size = what.st_size
+            if stat.S_ISDIR(what.st_mode):
+                raise OSError(errno.EISDIR, f"read {path}: it is a folder; want a recording")
             if self._read(0, len(mcap.MAGIC)) != mcap.MAGIC:
-                raise OSError(22, f"read {path}: it is no recording: it does not begin as MCAP files do")
+                raise OSError(errno.EINVAL, f"read {path}: it is no recording: it does not begin as MCAP files do")
         except OSError:
             os.close(self._fd)
             raise

@@ -160,9 +160,11 @@ def rewrite(
             file.flush()
             os.fsync(file.fileno())
         os.replace(half, target)
-    except BaseException:
+    except BaseException as error:
         with suppress(OSError):
             os.unlink(half)
+        if isinstance(error, OSError) and error.filename == half:
+            error.filename = target  # what was asked for
         raise
     return lost
 

@@ -162,6 +162,8 @@ def _whole(values: Any, name: str) -> NDArray[np.int64]:
 
 def read_nominal(folder: Path) -> Finger:
     """Read the finger as built from nominal.toml or nominal.json."""
+    if not folder.is_dir():
+        raise ValueError(f"read {folder}: no such folder; want one with recordings and nominal.toml")
     text = folder / "nominal.toml"
     if text.exists():
         return from_toml(read_text(text))

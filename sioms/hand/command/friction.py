@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import math
 
-from sioms.arguments import positive
+from sioms.arguments import positive, whole
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("--speed", type=positive, default=5.0, metavar="MM/S", help="drag speed (default 5)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the noise (default 1)")
+    parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="seed of the noise (default 1)")
 
 
 def run(args: argparse.Namespace) -> int:

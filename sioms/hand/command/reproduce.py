@@ -7,13 +7,15 @@ from __future__ import annotations
 
 import argparse
 
+from sioms.arguments import whole
+
 NAMES = tuple(f"E{number}" for number in range(1, 10))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("names", nargs="*", metavar="NAME", help="E1 to E9; all when none is named")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the noise (default 1)")
+    parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="seed of the noise (default 1)")
 
 
 def run(args: argparse.Namespace) -> int:

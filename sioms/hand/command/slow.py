@@ -6,6 +6,8 @@ import argparse
 import sys
 from pathlib import Path
 
+from sioms.arguments import positive
+
 PACE = 0.25
 
 
@@ -13,7 +15,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("config", type=Path, metavar="FILE", help="configuration of the cell, such as etc/hand.toml")
     parser.add_argument(
-        "--pace", type=float, default=PACE, metavar="P", help=f"simulated seconds per second (default {PACE:g})"
+        "--pace", type=positive, default=PACE, metavar="P", help=f"simulated seconds per second (default {PACE:g})"
     )
     parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="output file (default: standard output)")
 

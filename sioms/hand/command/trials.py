@@ -8,12 +8,14 @@ from __future__ import annotations
 import argparse
 import math
 
+from sioms.arguments import whole
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("--count", type=int, default=10, metavar="N", help="objects (default 10)")
-    parser.add_argument("--first", type=int, default=0, metavar="N", help="number of the first object (default 0)")
-    parser.add_argument("--seed", type=int, default=1, metavar="N", help="seed of the objects (default 1)")
+    parser.add_argument("--count", type=whole(1), default=10, metavar="N", help="objects (default 10)")
+    parser.add_argument("--first", type=whole(), default=0, metavar="N", help="number of the first object (default 0)")
+    parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="seed of the objects (default 1)")
 
 
 def run(args: argparse.Namespace) -> int:

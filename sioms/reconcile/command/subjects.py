@@ -13,7 +13,7 @@ from math import radians
 from pathlib import Path
 from typing import Any
 
-from sioms.arguments import positive, whole
+from sioms.arguments import positive, radius, whole
 from sioms.whole_file import write_whole
 
 Say = Callable[[str], None]
@@ -149,7 +149,7 @@ def _tactile_arguments(parser: argparse.ArgumentParser) -> Any:
     )
     group.add_argument(
         "--indenters",
-        type=float,
+        type=radius,
         nargs="+",
         default=[0.0],
         metavar="R",

@@ -73,6 +73,8 @@ def describe(data: Path) -> Draft:
     Raises:
         BadInputError: there is none that can be read.
     """
+    if not data.exists():
+        raise BadInputError(f"describe {data}: no such file or folder")
     files = [data] if data.is_file() else sorted(p for p in data.glob("*") if p.suffix in SUFFIXES)
     if not files:
         raise BadInputError(f"describe {data}: no data files; expects one of {', '.join(SUFFIXES)}")

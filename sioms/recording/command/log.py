@@ -6,7 +6,7 @@ import argparse
 import errno
 import os
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,8 @@ from sioms.recording.reader import Recording
 from sioms.recording.rewrite import rewrite
 from sioms.recording.story import happened, sentence, utc
 from sioms.recording.tables import head_of, main_column, of_events, of_table
+
+PICTURES = (".png", ".svg", ".pdf")
 
 
 def add_parser(subparsers: Any) -> None:
@@ -87,9 +89,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _export(recording: Recording, args: argparse.Namespace) -> None:
-    path, offset_ns = _fresh(args.output), recording.offset_ns
-    if path.suffix not in FORMATS:
-        raise OSError(errno.EINVAL, f"export to {path}: want a name that ends in {', '.join(FORMATS)}")
+    path, offset_ns = _fresh(args.output, FORMATS), recording.offset_ns
     start_ns, end_ns = (each - offset_ns for each in _span(recording, args))
     if args.events:
         events = [event for event in recording.events() if start_ns <= event.stamp_ns < end_ns]
@@ -105,10 +105,17 @@ def _export(recording: Recording, args: argparse.Namespace) -> None:
     export(of_table(info, table), path, table.stamps_ns + offset_ns, about)
 
 
-def _fresh(path: str) -> Path:
+def _fresh(text: str, endings: Sequence[str] = ()) -> Path:
+    """Return the path of a file that can be written and is not there yet, of one of some kinds if any are given."""
+    path = Path(text)
+    if not text or not path.parent.is_dir():
+        folder = f"there is no folder {path.parent}; make it, or " if text else "want a path; "
+        raise OSError(errno.ENOENT, f"write {text or repr(text)}: {folder}name another file")
     if os.path.exists(path):
         raise OSError(errno.EEXIST, f"write {path}: it is there already; name another file, or remove it")
-    return Path(path)
+    if endings and path.suffix not in endings:
+        raise OSError(errno.EINVAL, f"write {path}: want a name that ends in {', '.join(endings)}")
+    return path
 
 
 def _span(recording: Recording, args: argparse.Namespace) -> tuple[int, int]:
@@ -117,7 +124,15 @@ def _span(recording: Recording, args: argparse.Namespace) -> tuple[int, int]:
         return 0, 1 << 62
     first, last, _ = recording.span()
     start = first if args.start is None else first + int(args.start * 1e9)
-    return start, (last + 1 if args.end is None else first + int(args.end * 1e9))
+    end = last + 1 if args.end is None else first + int(args.end * 1e9)
+    if start >= end:
+        length_s = (last - first) / 1e9
+        raise OSError(
+            errno.EINVAL,
+            f"read {recording.path}: nothing is between --from {args.start or 0.0:g} and --to "
+            f"{length_s if args.end is None else args.end:g} s; it is {length_s:.3f} s long",
+        )
+    return start, end
 
 
 def _info(path: str, with_events: bool) -> list[str]:
@@ -179,6 +194,7 @@ def _plot(args: argparse.Namespace) -> list[str]:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    picture = _fresh(args.output, PICTURES)
     with Recording(args.file) as recording:
         names: Iterable[str] = args.nodes or recording.nodes
         nodes = [recording.node(name) for name in names]
@@ -203,5 +219,5 @@ def _plot(args: argparse.Namespace) -> list[str]:
                 for axis in axes:
                     axis.axvline((event.stamp_ns - zero) / 1e9, color="red", lw=0.6)
         axes[-1].set_xlabel("time [s]")
-        figure.savefig(_fresh(args.output))
+        figure.savefig(picture)
         return list(recording.damage)

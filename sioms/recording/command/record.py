@@ -9,7 +9,7 @@ import sys
 import time
 from typing import Any
 
-from sioms.arguments import positive
+from sioms.arguments import LARGEST, positive
 from sioms.client.workcell import Workcell
 from sioms.prompt import be_prompt
 from sioms.recording.live.files import LiveFile
@@ -27,9 +27,10 @@ def size(text: str) -> int:
         (2000, 1500000)
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([kMGT]?)B?", text)
-    if not match or not float(match[1]):
+    bytes_ = float(match[1]) * 1000.0 ** (" kMGT".index(match[2]) if match[2] else 0) if match else 0.0
+    if not 1.0 <= bytes_ <= LARGEST:
         raise argparse.ArgumentTypeError(f"{text!r}: want a size, as 500M or 2G")
-    return int(float(match[1]) * 1000 ** (" kMGT".index(match[2]) if match[2] else 0))
+    return int(bytes_)
 
 
 def add_parser(subparsers: Any) -> None:

@@ -12,6 +12,8 @@ import sys
 import time
 from pathlib import Path
 
+from sioms.arguments import not_negative, positive, whole
+
 
 def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
     """Add the `tactile` command to the `sioms` parser."""
@@ -19,14 +21,16 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     commands = parser.add_subparsers(dest="tactile_command", required=True, metavar="COMMAND")
 
     design = commands.add_parser("design", help="predict the accuracy of a finger design")
-    design.add_argument("--core-mm", type=float, default=9.6, help="core radius (default 9.6)")
-    design.add_argument("--outer-mm", type=float, default=12.7, help="outer radius (default 12.7)")
-    design.add_argument("--depth-mm", type=float, default=2.4, help="effective depth of the elements (default 2.4)")
-    design.add_argument("--elements", type=int, default=16, help="number of elements (default 16)")
-    design.add_argument("--pitch-deg", type=float, default=9.22, help="angle between elements (default 9.22)")
-    design.add_argument("--poisson", type=float, default=0.46, help="Poisson's ratio (default 0.46)")
-    design.add_argument("--shear-pa", type=float, default=8.3e4, help="shear modulus in Pa (default 8.3e4)")
-    design.add_argument("--noise-percent", type=float, default=0.1, help="strain noise in per cent (default 0.1)")
+    design.add_argument("--core-mm", type=positive, default=9.6, help="core radius (default 9.6)")
+    design.add_argument("--outer-mm", type=positive, default=12.7, help="outer radius (default 12.7)")
+    design.add_argument("--depth-mm", type=positive, default=2.4, help="effective depth of the elements (default 2.4)")
+    design.add_argument("--elements", type=whole(1), default=16, help="number of elements (default 16)")
+    design.add_argument("--pitch-deg", type=positive, default=9.22, help="angle between elements (default 9.22)")
+    design.add_argument("--poisson", type=not_negative, default=0.46, help="Poisson's ratio (default 0.46)")
+    design.add_argument("--shear-pa", type=positive, default=8.3e4, help="shear modulus in Pa (default 8.3e4)")
+    design.add_argument(
+        "--noise-percent", type=not_negative, default=0.1, help="strain noise in per cent (default 0.1)"
+    )
     design.add_argument("-o", "--output", type=Path, default=Path("design.html"), help="report (default design.html)")
 
     reproduce = commands.add_parser(
@@ -45,7 +49,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
         help="contact model, instead of choosing it from the data",
     )
     calibrate.add_argument("--no-map", action="store_true", help="do not identify the E map directly")
-    calibrate.add_argument("--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)")
+    calibrate.add_argument("--edge-deg", type=positive, default=45.0, help="half angle of the edge (default 45)")
 
     calibrate.add_argument(
         "--doubtful", action="store_true", help="write the finger even if the calibration is refused"
@@ -54,18 +58,18 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     score = commands.add_parser("score", help="calibrate with part of the touches, test on the rest, print a table")
     score.add_argument("data", type=Path, nargs="+", help="folders of recordings, or folders of such folders")
     score.add_argument("--truth", type=Path, help="folder with the truth of generated data, NAME.json")
-    score.add_argument("--jobs", type=int, help="processes (default: one for each core)")
-    score.add_argument("--edge-deg", type=float, default=45.0, help="half angle of the edge indenter (default 45)")
+    score.add_argument("--jobs", type=whole(1), help="processes (default: one for each core)")
+    score.add_argument("--edge-deg", type=positive, default=45.0, help="half angle of the edge (default 45)")
 
     shape = commands.add_parser("shape", help="fit recorded frames on all cores: a table of what touched")
     shape.add_argument("data", type=Path, nargs="+", help="recordings (*.npz with raw and time), or folders of them")
     shape.add_argument("--finger", type=Path, required=True, help="calibrated finger (from calibrate)")
     shape.add_argument("-o", "--output", type=Path, default=Path("shapes.csv"), help="table (default shapes.csv)")
-    shape.add_argument("--jobs", type=int, help="processes (default: one for each core)")
-    shape.add_argument("--settle", type=int, default=20, help="untouched frames averaged for the baseline (default 20)")
+    shape.add_argument("--jobs", type=whole(1), help="processes (default: one for each core)")
+    shape.add_argument("--settle", type=whole(1), default=20, help="untouched frames averaged (default 20)")
     shape.add_argument(
         "--load-deviation",
-        type=float,
+        type=not_negative,
         metavar="N/M",
         help="use the recorded force, known to this deviation in N/m",
     )

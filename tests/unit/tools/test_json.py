@@ -2,38 +2,19 @@
 
 from __future__ import annotations
 
-import argparse
 import json
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import pytest
 from recording_rig import OFFSET_NS, START_NS, write
+from tool_rig import parsers
 
 from sioms.client.keys import Folder
-from sioms.tools.front import installed, main
+from sioms.tools.front import main
 
 LISTS = {"list", "info", "status", "alarms", "blackbox"}
 """Commands and actions that list."""
-
-
-def parsers() -> dict[str, argparse.ArgumentParser]:
-    """Return the parsers of all commands and actions by their words."""
-    found: dict[str, argparse.ArgumentParser] = {}
-
-    def walk(parser: argparse.ArgumentParser, words: str) -> None:
-        for action in parser._actions:
-            if isinstance(action, argparse._SubParsersAction):
-                for name, inner in action.choices.items():
-                    found[f"{words} {name}".strip()] = inner
-                    walk(inner, f"{words} {name}".strip())
-
-    for module in {command.module for command in installed().values()}:
-        parser = argparse.ArgumentParser()
-        import_module(module).add_parser(parser.add_subparsers())
-        walk(parser, "")
-    return found
 
 
 def test_every_command_that_lists_does_so_as_json() -> None:
