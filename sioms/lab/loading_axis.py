@@ -125,7 +125,8 @@ class LoadingAxis:
         What a busy device or line brings late was felt before the move that led here.
         """
         begin_ns, last = time.monotonic_ns(), self.force.read().number
-        deadline, seen = time.monotonic() + MOVE_S, []
+        deadline = time.monotonic() + MOVE_S
+        seen: list[Any] = []
         while len(seen) < samples:
             if time.monotonic() > deadline:
                 raise ExperimentStopped(f"read {self.force.name}: no {samples} samples within {MOVE_S:g} s")
