@@ -7,12 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.floor import lap, lap_floor
 from sioms.reconcile.prepare import UNTOUCHED, Options, prepare
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.report.pictures import _trace_picture
 from sioms.reconcile.timed import Timed
 from sioms.reconcile.verdict import Gap, NamedEffect
 
@@ -92,6 +95,12 @@ def test_pictures_show_the_records_that_count_and_floor_and_remainder_are_two_nu
     assert [t.name for t in verdict.traces] == [r.name for r in session.records]
     for trace, record in zip(verdict.traces, session.records, strict=True):
         assert trace.untouched_s == pytest.approx((1.0 - UNTOUCHED) * len(record) * model.sample_time_s, abs=2e-3)
+    for axes, trace in zip(_trace_picture(Figure(), verdict).axes, verdict.traces, strict=True):
+        (shade,) = axes.patches
+        assert isinstance(shade, Rectangle)
+        assert (shade.get_x(), shade.get_x() + shade.get_width()) == pytest.approx(
+            (trace.untouched_s, trace.time_s[-1])
+        )
 
 
 def test_a_force_in_time_is_not_looked_for_in_records_that_had_none() -> None:
