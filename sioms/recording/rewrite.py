@@ -161,10 +161,10 @@ def rewrite(
             os.fsync(file.fileno())
         os.replace(half, target)
     except BaseException as error:
-        with suppress(OSError):
-            os.unlink(half)
         if isinstance(error, OSError) and error.filename == half:
             error.filename = target  # what was asked for
+        with suppress(OSError):
+            os.unlink(half)
         raise
     return lost
 
