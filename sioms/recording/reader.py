@@ -156,8 +156,9 @@ class Recording:
         try:
             what = os.fstat(self._fd)
             self.size = what.st_size
-            if stat.S_ISDIR(what.st_mode):
-                raise OSError(errno.EISDIR, f"read {path}: it is a folder; want a recording")
+            if not stat.S_ISREG(what.st_mode):
+                kind = "a folder" if stat.S_ISDIR(what.st_mode) else "no ordinary file"
+                raise OSError(errno.EINVAL, f"read {path}: it is {kind}; want a recording")
             if self._read(0, len(mcap.MAGIC)) != mcap.MAGIC:
                 raise OSError(errno.EINVAL, f"read {path}: it is no recording: it does not begin as MCAP files do")
         except OSError:
