@@ -30,7 +30,8 @@ from .daemon import Daemon
 from .rigs import Axis, Output, Rig
 
 ANSWER_S = 5.0
-START_S = 30.0
+START_S = 90.0
+"""Longest time until a process says that it is ready; on a busy machine it may get little of the processor [s]."""
 UP_S = 15.0
 STILL_S = 5.0
 """Longest time until an axis rests after a trial [s]."""

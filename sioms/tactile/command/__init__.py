@@ -28,9 +28,7 @@ def add_parser(subparsers: argparse._SubParsersAction[argparse.ArgumentParser]) 
     design.add_argument("--pitch-deg", type=positive, default=9.22, help="angle between elements (default 9.22)")
     design.add_argument("--poisson", type=not_negative, default=0.46, help="Poisson's ratio (default 0.46)")
     design.add_argument("--shear-pa", type=positive, default=8.3e4, help="shear modulus in Pa (default 8.3e4)")
-    design.add_argument(
-        "--noise-percent", type=not_negative, default=0.1, help="strain noise in per cent (default 0.1)"
-    )
+    design.add_argument("--noise-percent", type=positive, default=0.1, help="strain noise in per cent (default 0.1)")
     design.add_argument("-o", "--output", type=Path, default=Path("design.html"), help="report (default design.html)")
 
     reproduce = commands.add_parser(

@@ -237,14 +237,16 @@ def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.Capt
     assert command("design", "--depth-mm", "4", "-o", str(tmp_path / "d.html")) == 1
     assert "elements 4.0 mm deep are at radius 8.7 mm; need between 9.6 and 12.7 mm" in capsys.readouterr().err
     for words, answer in (
-        (("--pitch-deg", "-9"), "16 elements -9 deg apart; need a positive pitch"),
         (("--pitch-deg", "30"), "less than a turn"),
-        (("--noise-percent", "0"), "noise of 0 %; need a positive number"),
         (("--poisson", "0.6"), "Poisson's ratio"),
         (("--elements", "3"), "need at least 4"),
     ):
         assert command("design", *words, "-o", str(tmp_path / "d.html")) == 1
         assert answer in capsys.readouterr().err
+    for option, text in (("--pitch-deg", "-9"), ("--noise-percent", "0"), ("--core-mm", "nan")):
+        with pytest.raises(SystemExit):
+            command("design", option, text, "-o", str(tmp_path / "d.html"))
+        assert f"argument {option}: '{text}' is no number above 0" in capsys.readouterr().err
     assert not (tmp_path / "d.html").exists()
 
 
@@ -400,4 +402,5 @@ def test_shape_names_what_it_cannot_fit(tmp_path: Path, capsys: pytest.CaptureFi
     assert f"read {tmp_path / 'x.npz'}" in refusal(str(tmp_path), "--finger", finger)
     missing = refusal(str(tmp_path), "--finger", "/none/finger.toml")
     assert missing == "sioms tactile shape: open /none/finger.toml: no such file or directory\n"
-    assert "deviation is -1" in refusal(str(tmp_path), "--finger", finger, "--load-deviation", "-1")
+    with pytest.raises(SystemExit):
+        refusal(str(tmp_path), "--finger", finger, "--load-deviation", "-1")
