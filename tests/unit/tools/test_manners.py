@@ -77,7 +77,8 @@ def nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Work in an empty folder, without a daemon, with keys of one's own."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SIOMS_SOCKET", str(tmp_path / "none.sock"))
-    for name in ("SIOMS_KEYS", "XDG_CONFIG_HOME", "XDG_STATE_HOME", "HOME"):
+    monkeypatch.setenv("SIOMS_KEYS", str(tmp_path / "keys"))
+    for name in ("XDG_CONFIG_HOME", "XDG_STATE_HOME", "HOME"):
         monkeypatch.setenv(name, str(tmp_path / "home"))
     monkeypatch.delenv("SIOMS_CELL", raising=False)
 
