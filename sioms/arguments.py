@@ -22,8 +22,8 @@ def whole(least: int = 0, most: int = MOST) -> Callable[[str], int]:
         except ValueError:
             value = least - 1
         if not least <= value <= most:
-            to = f"to {most}" if value > most else "on"
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number from {least} {to}")
+            to = f" and <= {most}" if value > most else ""
+            raise argparse.ArgumentTypeError(f"{text!r}: must be an integer >= {least}{to}")
         return value
 
     return read
@@ -33,8 +33,8 @@ def positive(text: str) -> float:
     """Read a number above 0, of any sensible size."""
     value = _number(text)
     if not 0.0 < value <= LARGEST:
-        to = f" up to {LARGEST:g}" if value > LARGEST else ""
-        raise argparse.ArgumentTypeError(f"{text!r} is no number above 0{to}")
+        to = f" and <= {LARGEST:g}" if value > LARGEST else ""
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a number > 0{to}")
     return value
 
 
@@ -42,7 +42,7 @@ def not_negative(text: str) -> float:
     """Read a number from 0 on, of any sensible size."""
     value = _number(text)
     if not 0.0 <= value <= LARGEST:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number from 0 to {LARGEST:g}")
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a number from 0 to {LARGEST:g}")
     return value
 
 
@@ -50,7 +50,7 @@ def radius(text: str) -> float:
     """Read a radius: 0 is an edge, inf a flat."""
     value = _number(text)
     if not (0.0 <= value <= LARGEST or value == math.inf):
-        raise argparse.ArgumentTypeError(f"{text!r} is no radius; want a number from 0 on, or inf")
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a number >= 0, or inf")
     return value
 
 
@@ -69,7 +69,7 @@ def seconds(text: str) -> float:
     """Read a time of either sign [s]."""
     value = _number(text)
     if not abs(value) <= LONGEST_S:
-        raise argparse.ArgumentTypeError(f"{text!r} is no time in seconds, of {LONGEST_S:g} s at most")
+        raise argparse.ArgumentTypeError(f"{text!r}: must be a time in seconds, at most {LONGEST_S:g}")
     return value
 
 

@@ -158,11 +158,12 @@ class SimAxes(TickDriver):
         SimAxes._checked = (settings, built)
         if settings.carries and (motors is None or motors.position.size < JOINTS):
             raise ValueError(f"carries: fewer than {JOINTS} motors; want those of a finger's joints x, y and th first")
-        if not 1.0 / settings.tick_hz < settings.world_age_max_s < math.inf:
+        described = cls._describe(settings)
+        if described.inputs and not 1.0 / settings.tick_hz < settings.world_age_max_s < math.inf:
             raise ValueError(
                 f"world_age_max_s {settings.world_age_max_s:g}; want more than a tick, {1 / settings.tick_hz:g} s"
             )
-        return cls._describe(settings)
+        return described
 
     @staticmethod
     def _describe(settings: SimAxesSettings) -> Description:

@@ -123,7 +123,7 @@ def _timed(act: Callable[[float], object], i: int) -> int:
 def _server(text: str, environment: dict[str, str]) -> Iterator[str]:
     """Run a server; yield the first line that it prints."""
     process = subprocess.Popen(
-        [sys.executable, "-c", text], env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True,
+        [sys.executable, "-P", "-c", text], env={**os.environ, **environment}, stdout=subprocess.PIPE, text=True,
         preexec_fn=ends_with_us(),
     )  # fmt: skip
     try:

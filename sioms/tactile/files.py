@@ -156,7 +156,7 @@ def _recording(file: Any) -> Recording:
 def _whole(values: Any, name: str) -> NDArray[np.int64]:
     numbers = np.asarray(values, dtype=np.float64)
     if not np.all(numbers == np.round(numbers)):
-        raise ValueError(f"{name} holds a value that is no whole number")
+        raise ValueError(f"{name} holds a value that is not an integer")
     return numbers.astype(np.int64)
 
 

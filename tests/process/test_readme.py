@@ -103,7 +103,7 @@ def test_the_reconcile_example_says_what_it_says(tmp_path: Path) -> None:
     done = subprocess.run([BIN / "sioms", *words], capture_output=True, text=True, timeout=110, cwd=ROOT)
     assert "verdict: named" in done.stdout, done.stdout + done.stderr
     shown = README.partition(line)[2].partition("\n$ ")[0].strip().splitlines()
-    assert [each.partition(":")[0].split()[0] for each in shown] == ["verdict", "Stribeck", "where", "why", "gap"]
+    assert [each.partition(":")[0].split()[0] for each in shown] == ["verdict", "Stribeck", "where", "why", "model"]
     said = {_NUMBER.sub("#", each): each for each in done.stdout.splitlines()}
     for each in shown:
         assert _NUMBER.sub("#", each) in said, f"{each!r}; it says:\n{done.stdout}"

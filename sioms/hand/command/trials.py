@@ -22,8 +22,6 @@ def run(args: argparse.Namespace) -> int:
     """Carry out the trials; print a line for each, and the share of every family."""
     from sioms.hand.trials import SHAPES, WITHIN_RAD, carry_out, draw, share
 
-    if args.count < 1 or args.first < 0:
-        raise ValueError(f"try {args.count} objects from number {args.first}: want 1 or more, from 0 on")
     outcomes = []
     print(f"{'object':>6} {'shape':9} {'friction':>8} {'eta first':>9} {'eta last':>8} regrasps rolls  outcome")
     for number in range(args.first, args.first + args.count):

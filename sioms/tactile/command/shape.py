@@ -70,8 +70,6 @@ def _fit(block: Block) -> list[tuple[float, ...]]:
 def shape(args: argparse.Namespace) -> int:
     """Read, fit, write a table, tell what was found."""
     jobs = args.jobs or len(os.sched_getaffinity(0))
-    if args.settle < 1 or jobs < 1:
-        raise ValueError(f"fit frames: --settle {args.settle}, --jobs {jobs}; want 1 or more")
     compiled = False if args.plain else None
     finger = from_toml(read_text(args.finger))
     setting = Setting(finger, compiled, args.load_deviation, args.settle)

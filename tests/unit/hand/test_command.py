@@ -40,8 +40,9 @@ def test_trials_count_what_becomes_of_objects(capsys: pytest.CaptureFixture[str]
 
 
 def test_no_trials_are_refused(capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(_words("trials", "--count", "0")) == 1
-    assert "want 1 or more" in capsys.readouterr().err
+    with pytest.raises(SystemExit, match="2"):
+        run(_words("trials", "--count", "0"))
+    assert "must be an integer >= 1" in capsys.readouterr().err
 
 
 def test_single_skills_follow_one_another_on_one_hand() -> None:

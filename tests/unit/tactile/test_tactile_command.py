@@ -213,7 +213,7 @@ def test_calibrate_names_what_is_wrong(folder: Path, tmp_path: Path, capsys: pyt
         ({"raw": lambda a: np.where(np.arange(len(a))[:, None] < len(a) // 4, np.nan, a)}, "touch 0: element 0 holds a "
                                                                                            "reading"),
         ({"time": lambda a: a[::-1]}, "time falls or is no number after frame 0"),
-        ({"touch": lambda a: a + 0.5}, "touch holds a value that is no whole number"),
+        ({"touch": lambda a: a + 0.5}, "touch holds a value that is not an integer"),
     ],
 )  # fmt: skip
 def test_recordings_of_another_unit_or_order_are_refused(
@@ -246,7 +246,7 @@ def test_design_refuses_what_cannot_be_built(tmp_path: Path, capsys: pytest.Capt
     for option, text in (("--pitch-deg", "-9"), ("--noise-percent", "0"), ("--core-mm", "nan")):
         with pytest.raises(SystemExit):
             command("design", option, text, "-o", str(tmp_path / "d.html"))
-        assert f"argument {option}: '{text}' is no number above 0" in capsys.readouterr().err
+        assert f"argument {option}: '{text}': must be a number > 0" in capsys.readouterr().err
     assert not (tmp_path / "d.html").exists()
 
 
