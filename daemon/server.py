@@ -183,7 +183,7 @@ class Server:
             device.tell(driver_verbs.StopChanged())
         self.shared.record.look()
         if not known or not self.shared.record.state.workcell:
-            self._note(workcell_entry(source, stop=True, named=True))
+            self._note(workcell_entry(source, stop=True, named=True, latched_ns=latch.stopped_ns))
 
     def hear_request(self) -> str:
         """Obey the stop-request file; return who has asked for a stop that nobody had heard yet, '' for nobody.
@@ -201,7 +201,8 @@ class Server:
 
     def reset_workcell(self, who: str) -> None:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
-        self._note(workcell_entry(who, stop=False))  # first: a stop that comes next is noted after it
+        latched_ns = self.shared.latch.stopped_ns
+        self._note(workcell_entry(who, stop=False, latched_ns=latched_ns))  # first: a later stop is noted after it
         self.shared.latch.reset(self._request_seen)  # what has been asked for since then has not been heard
         self.log("warning", "reset", by=who)
         for device in self.devices.values():

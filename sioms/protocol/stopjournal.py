@@ -28,7 +28,9 @@ if TYPE_CHECKING:
     Part: TypeAlias = tuple[str, str, int, int]
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
-NODE, WORKCELL, CHECKPOINT, PID = "node", "workcell", "checkpoint", "pid"
+NODE, WORKCELL, CHECKPOINT, PID, LATCHED = "node", "workcell", "checkpoint", "pid", "latched"
+MOST_ENDED = 16
+"""Stops of the workcell that are known to have been reset: a driver that notes one of them later does not stop anew."""
 MOST_PARTS = 1 << 20
 """Channels, and bits of channels, that an entry may name, and that may be stopped in all."""
 LAST_S = 1e11
@@ -55,9 +57,18 @@ def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:
     return [(channel, bit)] if bit >= 0 else [(channel, b) for b in range(width or 1)]
 
 
-def workcell_entry(source: str, *, stop: bool, named: bool = False) -> dict[str, Any]:
-    """Return the entry of the stop or the reset of the workcell; ``named``: it says better who has stopped it."""
-    return {WORKCELL: "", "stop": stop, "by": source, **({"named": True} if named else {})}
+def workcell_entry(source: str, *, stop: bool, named: bool = False, latched_ns: int = 0) -> dict[str, Any]:
+    """Return the entry of the stop or the reset of the workcell.
+
+    Args:
+        source: who did it, and why.
+        stop: whether it is a stop.
+        named: it says better who has stopped it.
+        latched_ns: when the stop was latched, by which it is known [ns, CLOCK_MONOTONIC]; of a reset, the stop that it
+            ends. 0: unknown.
+    """
+    known = {LATCHED: latched_ns} if latched_ns else {}
+    return {WORKCELL: "", "stop": stop, "by": source, **({"named": True} if named else {}), **known}
 
 
 def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
@@ -94,11 +105,13 @@ class Stopped:
         workcell: who has stopped the workcell, '' when it is not stopped.
         since_s: when that was [s since 1970].
         parts: of nodes that are stopped: who did it, and the name of the node.
+        ended: when the last stops of the workcell that were reset had been latched [ns, CLOCK_MONOTONIC].
     """
 
     workcell: str = ""
     since_s: float = 0.0
     parts: dict[Part, tuple[str, str]] = field(default_factory=dict)
+    ended: tuple[int, ...] = ()
 
     def apply(self, entry: Mapping[str, Any]) -> None:
         """Take an entry into account.
@@ -108,9 +121,14 @@ class Stopped:
         """
         stop, by = bool(entry["stop"]), printable(str(entry["by"]), 400)
         if WORKCELL in entry:
+            latched_ns = int(entry.get(LATCHED, 0))
             if not stop:
                 self.workcell, self.since_s = "", 0.0
                 self.parts.clear()
+                if latched_ns:
+                    self.ended = (*self.ended, latched_ns)[-MOST_ENDED:]
+            elif latched_ns in self.ended:
+                return  # it was noted behind its own reset
             elif not self.workcell or entry.get("named"):
                 if not 0 <= (at := float(entry["at"])) < LAST_S:
                     raise ValueError(f"at {at} s")
@@ -163,7 +181,7 @@ class Stopped:
 
     def entries(self) -> list[dict[str, Any]]:
         """Return entries that lead from nothing to this state."""
-        entries: list[dict[str, Any]] = []
+        entries = [workcell_entry("", stop=False, latched_ns=latched_ns) for latched_ns in self.ended]
         if self.workcell:
             entries.append({**workcell_entry(self.workcell, stop=True), "at": self.since_s})
         for device in dict.fromkeys(part[0] for part in self.parts):

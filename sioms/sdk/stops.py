@@ -125,10 +125,11 @@ class Stops:
 
     def stop_workcell(self, source: str) -> None:
         """Stop the whole workcell."""
-        fresh = self._latch.stop(time.monotonic_ns(), source)
+        now_ns = time.monotonic_ns()
+        fresh = self._latch.stop(now_ns, source)
         self.look()
         if fresh:
-            self._note(workcell_entry(source, stop=True))
+            self._note(workcell_entry(source, stop=True, latched_ns=now_ns))
             self._request.request(time.monotonic_ns(), os.getpid(), source)  # wakes the other drivers
             self._tell(Stopped(source))
 
@@ -177,7 +178,7 @@ class Stops:
             self._stops_again = False
         if fresh:
             if stopped_ns:  # also by another driver, which may not have come to note it
-                self._note(workcell_entry(latch.source, stop=True))
+                self._note(workcell_entry(latch.source, stop=True, latched_ns=stopped_ns))
             self._request.take(mark)
         if not stopped_ns and self.stopped:
             self._effects.note()

@@ -17,6 +17,7 @@ import pytest
 from sioms.daemon import stop_record
 from sioms.daemon.stop_record import StopRecord
 from sioms.protocol.stopjournal import (
+    MOST_ENDED,
     StopJournal,
     Stopped,
     channels_and_bits,
@@ -69,6 +70,23 @@ def test_what_is_noted_is_there_after_a_death_without_an_end(path: str) -> None:
     assert not again.state.workcell and not again.state.parts
     again.close()
     assert not os.path.exists(path)
+
+
+def test_a_stop_that_is_noted_behind_its_own_reset_is_over(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver notes a stop when it has done it; others may have seen it, and its reset, before."""
+    monkeypatch.setattr(stop_record, "MOST_BYTES", 1)  # a checkpoint after every entry
+    record = StopRecord(path)
+    for latched_ns in range(5, 5 + MOST_ENDED):
+        record.note(workcell_entry("ann", stop=True, named=True, latched_ns=latched_ns))
+        record.note(workcell_entry("ann", stop=False, latched_ns=latched_ns))
+    for latched_ns in range(5, 5 + MOST_ENDED):
+        record.note(workcell_entry("pid 7", stop=True, latched_ns=latched_ns))
+    assert not record.state.workcell and not kept(path).workcell
+    record.note(workcell_entry("bob", stop=True, latched_ns=4))
+    assert record.state.workcell == kept(path).workcell == "bob", "no other stop is taken for it, not an earlier one"
+    record.note(workcell_entry("ann", stop=False))
+    record.note(workcell_entry("bob", stop=True))
+    assert kept(path).workcell == "bob", "nor one of which that is not known"
 
 
 def test_a_bit_is_stopped_and_reset_by_itself(path: str) -> None:
