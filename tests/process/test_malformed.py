@@ -24,8 +24,8 @@ from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, ClientVer
 from sioms.protocol.records import AXIS_WRITE
 
 SEED = 20240607
-FUZZ_S = 4.0
-"""Of wall time on each socket; millions of frames are for the bench."""
+FUZZED = 2000
+"""Messages to a handle, five times as many to the daemon; millions are for the bench."""
 
 
 class Raw:
@@ -180,11 +180,11 @@ BAD_HANDLE = [
 ]
 
 
-@pytest.mark.parametrize("packet", BAD_SESSION, ids=lambda p: p[:12].hex() or "empty")
-def test_bad_message_ends_its_session_only(bystander: Bystander, raw: Callable[[], Raw], packet: bytes) -> None:
-    session = raw()
-    session.sock.send(packet)
-    assert session.is_ended()
+def test_bad_messages_end_their_sessions_only(bystander: Bystander, raw: Callable[[], Raw]) -> None:
+    for packet in BAD_SESSION:
+        session = raw()
+        session.sock.send(packet)
+        assert session.is_ended(), packet[:40]
 
 
 ODD_ARGUMENTS: list[tuple[Request, object]] = [
@@ -218,16 +218,16 @@ def test_an_odd_argument_is_refused_with_a_sentence_fit_to_be_shown(
         assert reply[3].isprintable() and len(reply[3]) < 300, reply
 
 
-@pytest.mark.parametrize("packet", BAD_HANDLE, ids=lambda p: p[:12].hex() or "empty")
-def test_bad_message_ends_its_handle_only(
-    bystander: Bystander, handle: Callable[..., tuple[Raw, Raw]], daemon: Daemon, packet: bytes
+def test_bad_messages_end_their_handles_only(
+    bystander: Bystander, handle: Callable[..., tuple[Raw, Raw]], cell: sioms.Workcell
 ) -> None:
-    session, node = handle("mod0.xaxis")
-    node.sock.send(packet)
-    assert node.is_ended()
-    assert session.ask(ClientVerb.STATUS, 2)[0][2] == 0, "the session lives on"
-    with daemon.cell() as cell:
+    for packet in BAD_HANDLE:
+        session, node = handle("mod0.xaxis")
+        node.sock.send(packet)
+        assert node.is_ended(), packet[:40]
+        assert session.ask(ClientVerb.STATUS, 2)[0][2] == 0, f"the session lives on after {packet[:40]!r}"
         cell.open("mod0.xaxis", "rw", timeout=2.0).close()
+        session.close()
 
 
 def test_end_of_a_session_is_told_in_the_log(start_daemon: Callable[..., Daemon]) -> None:
@@ -411,10 +411,10 @@ HARMLESS = [v for v in ClientVerb if v not in (ClientVerb.EMERGENCY_STOP, Client
 
 def test_fuzzed_sessions_do_nothing(bystander: Bystander, daemon: Daemon, raw: Callable[[], Raw]) -> None:
     chance = random.Random(SEED)
-    deadline, sent, ended = time.monotonic() + FUZZ_S, 0, 0
+    sent = ended = 0
     session = raw()
     session.sock.settimeout(0.0)
-    while time.monotonic() < deadline:
+    while sent < 5 * FUZZED:
         try:
             session.sock.send(_fuzz(chance, [int(v) for v in HARMLESS], chance.randrange(1, 1 << 40)))
             sent += 1
@@ -433,23 +433,23 @@ def test_fuzzed_sessions_do_nothing(bystander: Bystander, daemon: Daemon, raw: C
             session.sock.settimeout(0.0)
     session.close()
     print(f"{sent} messages sent to the daemon, {ended} sessions ended by them")
-    assert sent > 200 and ended > 10
+    assert ended > 10
 
 
 @pytest.mark.parametrize("name", ["mod0", "force0", "io0"])
 def test_fuzzed_handles_move_nothing(bystander: Bystander, daemon: Daemon, name: str) -> None:
     chance = random.Random(SEED)
     verbs = [int(v) for v in HandleVerb]
-    deadline, sent, ended = time.monotonic() + FUZZ_S / 2, 0, 0
+    sent = ended = 0
     with daemon.cell("fuzz") as cell:
         start = cell.open(f"{name}.readonly" if name != "force0" else name)
         before = start.read()
-        while time.monotonic() < deadline:
+        while sent < FUZZED:
             node = cell.open(name, "r" if name == "force0" else "rw", timeout=5.0)
             sock = socket.socket(fileno=os.dup(node._channel.fileno()))
             sock.setblocking(False)
             try:
-                while time.monotonic() < deadline:
+                while sent < FUZZED:
                     packet = _fuzz(chance, verbs, chance.randrange(1, 1 << 40))
                     sock.send(_without_stop(packet))
                     sent += 1
@@ -468,7 +468,7 @@ def test_fuzzed_handles_move_nothing(bystander: Bystander, daemon: Daemon, name:
                 node.close()
         cell.reset(name)
         print(f"{sent} messages sent to the driver of {name}, {ended} handles ended by them")
-        assert sent > 200 and ended > 5
+        assert ended > 5
         after = start.read()
         if name == "mod0":
             for a, b in zip(before.position, after.position, strict=True):
