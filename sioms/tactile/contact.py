@@ -21,12 +21,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import brentq
-from scipy.special import jv
 
+from sioms.tactile.bessel import bessel
 from sioms.tactile.cylinder import Cylinder
 from sioms.tactile.indenter import Indenter
 from sioms.tactile.series import pack, rotation
@@ -90,10 +91,10 @@ class Contact:
         """Return [p; q] [Pa], tension positive, with the middle of the strip at `angle` [rad]; length 4 nc + 2."""
         z = self.half_width * np.arange(highest + 1, dtype=np.float64)
         n = np.arange(self.normal.size)
-        bounded = 1j**n * (n + 1) * _over(n + 1, z)
+        bounded = 1j**n * (n + 1) * _over(n.size, z)
         w = self.half_width * (bounded @ self.normal)
         m = np.arange(self.adhering.size)
-        q = self.half_width * ((1j**m * jv(m, z[:, None])) @ self.adhering) - self.sliding * w
+        q = self.half_width * ((1j**m * bessel(m.size - 1, z)) @ self.adhering) - self.sliding * w
         w[0], q[0] = 0.5 * w[0], 0.5 * q[0]
         turn = rotation(angle, highest)
         return np.concatenate([turn @ pack(-w.real, -w.imag), turn @ pack(q.real, q.imag)])
@@ -217,17 +218,23 @@ def _apex(miss: Callable[[float], float], half_width: float) -> float:
 
 def _profile(cylinder: Cylinder, indenter: Indenter, a: float, offset: float, order: int) -> Floats:
     """Return the coefficients of the slope [m/rad] in T_0..T_order."""
-    angle = np.pi * (np.arange(_PROFILE_NODES) + 0.5) / _PROFILE_NODES
-    slope = indenter.slope(cylinder, a * np.cos(angle) - offset)
-    coefficients = 2.0 / _PROFILE_NODES * (np.cos(np.arange(order + 1)[:, None] * angle) @ slope)
-    coefficients[0] *= 0.5
+    places, tests = _profile_tests(order)
+    coefficients: Floats = tests @ indenter.slope(cylinder, a * places - offset)
     return coefficients
 
 
-def _over(n: NDArray[np.intp], z: Floats) -> Floats:
-    """Return J_n(z)/z with its limit at 0, shape (len(z), len(n)), n >= 1."""
+@lru_cache(maxsize=4)
+def _profile_tests(order: int) -> tuple[Floats, Floats]:
+    """Return nodes in -1..1 and the weights that take a slope at them to its coefficients in T_0..T_order."""
+    angle = np.pi * (np.arange(_PROFILE_NODES) + 0.5) / _PROFILE_NODES
+    tests = 2.0 / _PROFILE_NODES * np.cos(np.arange(order + 1)[:, None] * angle)
+    tests[0] *= 0.5
+    return np.cos(angle), tests
+
+
+def _over(highest: int, z: Floats) -> Floats:
+    """Return J_n(z)/z for n = 1..highest with its limit at 0, shape (len(z), highest)."""
     zero = z == 0.0
-    ratio = jv(n, np.where(zero, 1.0, z)[:, None]) / np.where(zero, 1.0, z)[:, None]
-    ratio[zero] = np.where(n == 1, 0.5, 0.0)
-    out: Floats = ratio
-    return out
+    ratio: Floats = bessel(highest, z)[:, 1:] / np.where(zero, 1.0, z)[:, None]
+    ratio[zero] = 0.5 * np.eye(1, highest)
+    return ratio

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -166,7 +167,8 @@ def _basis_many(cylinder: Cylinder, k: Extended, r: Extended) -> Extended:
     for sign, length in ((1.0, rb), (-1.0, ra)):  # upper sign grows outwards, lower sign decays
         x = r[None, :] / length
         n, m = 1.0 + sign * k, sign * k - 1.0
-        near, far = x ** (n - 1.0), x ** (m - 1.0)
+        near = x ** (n - 1.0)
+        far = near / x**2  # x^(m - 1)
         # the pair is divided by k^2 and k, so that no column outgrows the other
         rows.append(
             np.stack(
@@ -205,17 +207,24 @@ def _match(cylinder: Cylinder, k: Floats, r: Floats, basis: Basis) -> Floats:
     Extended precision, because growing and decaying solutions are nearly alike across a thin layer.
     """
     wave, radius = k.astype(np.longdouble), r.astype(np.longdouble)
-    edges = basis(cylinder, wave, np.array([cylinder.core_m, cylinder.outer_m], dtype=np.longdouble))
-    conditions = np.stack([edges[2, :, :, 0], edges[3, :, :, 0], edges[0, :, :, 1], edges[1, :, :, 1]])
-    loads = np.zeros((k.size, 4, 2), dtype=np.longdouble)
-    loads[:, 2, 0] = 1.0  # p cos kt alone
-    loads[:, 3, 1] = -1.0  # q sin kt = -1: the second argument of H is -q^s
-    amplitude = _solve(np.moveaxis(conditions, 2, 0), loads)
+    amplitude = _amplitudes(cylinder, tuple(k.tolist()), basis)
     fields = np.einsum("fskr,ksc->fkrc", basis(cylinder, wave, radius), amplitude)
     s_rr, s_rt, u_r, u_t = fields
     u_r, u_t = u_r / (2.0 * cylinder.shear_pa), u_t / (2.0 * cylinder.shear_pa)
     e_tt = (u_r + wave[:, None, None] * u_t) / radius[None, :, None]
     return np.stack([s_rr, -s_rt, u_r, -u_t, e_tt]).astype(np.float64)
+
+
+@lru_cache(maxsize=16)
+def _amplitudes(cylinder: Cylinder, wave: tuple[float, ...], basis: Basis) -> Extended:
+    """Return the amplitudes of the four solutions, shape (nk, 4, 2); the same at every radius of a cylinder."""
+    k = np.array(wave, dtype=np.longdouble)
+    edges = basis(cylinder, k, np.array([cylinder.core_m, cylinder.outer_m], dtype=np.longdouble))
+    conditions = np.stack([edges[2, :, :, 0], edges[3, :, :, 0], edges[0, :, :, 1], edges[1, :, :, 1]])
+    loads = np.zeros((k.size, 4, 2), dtype=np.longdouble)
+    loads[:, 2, 0] = 1.0  # p cos kt alone
+    loads[:, 3, 1] = -1.0  # q sin kt = -1: the second argument of H is -q^s
+    return _solve(np.moveaxis(conditions, 2, 0), loads)
 
 
 def _solve(matrix: Extended, right: Extended) -> Extended:

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import jv
 
+from sioms.tactile.bessel import bessel
 from sioms.tactile.cylinder import Cylinder, respond
 
 Floats = NDArray[np.float64]
@@ -71,11 +71,10 @@ class StripTables:
         # functions
         count = 256 * int(np.ceil(np.clip(reach / a + 2 * order, 256, 50.0 * reach) / 256))
         z = a * np.arange(1, count + 1)
-        bessel = jv(np.arange(order + 1), z[:, None])
         self.cylinder, self.a, self.order = cylinder, a, order
         self.rest = _remainders(cylinder, count)
-        self.on_t = bessel
-        self.on_u: Floats = bessel[:, 1:] * np.arange(1, order + 1) / z[:, None]
+        self.on_t = bessel(order, z)
+        self.on_u: Floats = self.on_t[:, 1:] * np.arange(1, order + 1) / z[:, None]
         self.own, self.cross = cylinder.normal_limit, cylinder.cross_limit
 
     def _layer(self, which: int, tests: Floats, trials: Floats) -> Floats:
