@@ -5,7 +5,6 @@ p-values.
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from sioms.reconcile.engine.evidence import place
 from sioms.reconcile.locate import bins_of
@@ -25,7 +24,8 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
         r = e[mine]
         if len(r) < 40 or np.ptp(values) == 0.0:
             continue
-        shuffled = (_shuffled(r, data.block[mine], rng) for _ in range(shifts))
+        parts = np.split(r, np.flatnonzero(np.diff(data.block[mine])) + 1)
+        shuffled = (_shuffled(parts, rng) for _ in range(shifts))
         shown = told[data.views[view]]
         bins = bins_of(values) if own is None else own
         out.append(place(f"{name} ({shown.title})", unit, r, values, bins, shuffled, shown.floor))
@@ -34,9 +34,13 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
     return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))
 
 
-def _shuffled(r: Array, block: NDArray[np.int64], rng: np.random.Generator) -> Array:
+def _shuffled(parts: list[Array], rng: np.random.Generator) -> Array:
     """Lay the blocks in another order, each turned within itself: neighbours stay neighbours, and nothing keeps its
     place.
     """
-    parts = np.split(r, np.flatnonzero(np.diff(block)) + 1)
-    return np.concatenate([np.roll(parts[i], int(rng.integers(len(parts[i])))) for i in rng.permutation(len(parts))])
+    pieces = []
+    for i in rng.permutation(len(parts)):
+        part = parts[i]
+        cut = len(part) - int(rng.integers(len(part)))
+        pieces += [part[cut:], part[:cut]]
+    return np.concatenate(pieces)

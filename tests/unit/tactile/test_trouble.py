@@ -50,7 +50,7 @@ class Finger:
         self.offset = self.random.uniform(-3.0, 3.0, 16)
         settings = {
             "line": {"serial": "/x", "baud": 12_000_000}, "channels": 16, "rate_hz": RATE, "scale": step, "unit": "%",
-            "format": "f32", "shape": {"finger_file": FINGER},
+            "format": "f32", "shape": {"finger_file": FINGER, "compiled": True},
         }  # fmt: skip
         self.now_ns = 0
         kit: Any = SimpleNamespace(publish=lambda block, stamp_ns: None, inputs={}, now_ns=lambda: self.now_ns)
