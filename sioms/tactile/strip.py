@@ -70,7 +70,7 @@ class StripTables:
         # beyond k a = 1 the layer's terms fall as k^-3 between bounded functions, as k^-2 with the edge
         # functions
         count = 256 * int(np.ceil(np.clip(reach / a + 2 * order, 256, 50.0 * reach) / 256))
-        z = a * np.arange(1, count + 1)
+        z = a * np.arange(1, count + 1, dtype=np.float64)
         self.cylinder, self.a, self.order = cylinder, a, order
         self.rest = _remainders(cylinder, count)
         self.on_t = bessel(order, z)

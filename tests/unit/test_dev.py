@@ -68,6 +68,13 @@ def test_a_moved_environment_is_mended(dev, tmp_path, monkeypatch, places):
     assert (second / "bin" / "theirs").read_bytes() == before
 
 
+def test_bytecode_is_kept(dev, tmp_path, monkeypatch):
+    monkeypatch.setenv("PYTHONDONTWRITEBYTECODE", "1")
+    (tmp_path / "once.py").write_text("")
+    subprocess.run([sys.executable, "-c", "import once"], cwd=tmp_path, env=dev.environment(), check=True)
+    assert [path.name.partition(".")[0] for path in (tmp_path / "__pycache__").iterdir()] == ["once"]
+
+
 def test_steps_are_compiled_again_after_a_change_of_any_of_them(dev):
     """Those of the drivers were not: after a change they ran as Python, at a multiple of the cost."""
     steps = {path for folder in ("sioms", "drivers", "daemon", "tools") for path in (TREE / folder).rglob("*_step.py")}
