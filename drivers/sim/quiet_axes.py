@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -14,16 +12,15 @@ from sioms.sdk.pages import Pages
 from sioms.sdk.quiet_step import Page
 
 from .axes_step import SimulatedAxes, advance_axes, brake_axes, rest_axes, tick_axes
-
-if TYPE_CHECKING:
-    from .axes import SimAxes
+from .axes_world import AxesWorld
 
 
 class QuietAxes:
     """The steps of motors and steppers that move and nothing else (QuietSteps).
 
     Args:
-        driver: theirs.
+        world: theirs.
+        make_up_ns: how long a tick may make up for turns [ns].
         pages: of the process.
         instants: where steps note theirs.
     """
@@ -33,47 +30,47 @@ class QuietAxes:
     rest = staticmethod(rest_axes)
     stop = staticmethod(brake_axes)
 
-    def __init__(self, driver: SimAxes, pages: Pages, instants: NDArray[np.int64]) -> None:
-        self._driver, self._axes, self._plant = driver, driver._axes, driver._plant
-        plant, motors, steppers = self._plant, driver._servos, driver._steppers
-        self._beams = beams_record(driver._beams, driver.bank.n)
+    def __init__(self, world: AxesWorld, make_up_ns: int, pages: Pages, instants: NDArray[np.int64]) -> None:
+        self._world = world
+        plant, motors, steppers = world.plant, world.servos, world.steppers
+        self._beams = beams_record(world.beams, world.bank.n)
         self.record = SimulatedAxes(
-            period_ns=driver._tick_ns, late_ns=driver._late_ns, make_up_ns=driver.make_up_ns, stride=driver._stride,
-            ahead=0, last_ns=0, found=0, plain=0, idle=0, may_rest=0, still=0, seen=driver._seen,
-            near=driver._near, loop=driver.bank.loop, stopping=driver.bank.stopping,
+            period_ns=world.tick_ns, late_ns=world.late_ns, make_up_ns=make_up_ns, stride=world.stride,
+            ahead=0, last_ns=0, found=0, plain=0, idle=0, may_rest=0, still=0, seen=world.seen,
+            near=world.near, loop=world.bank.loop, stopping=world.bank.stopping,
             motors=motors.record if motors else Motors.empty(),
             steppers=steppers.record if steppers else Steppers.empty(), beams=self._beams,
-            motor_rows=driver._servo_rows, stepper_rows=driver._stepper_rows,
+            motor_rows=world.servo_rows, stepper_rows=world.stepper_rows,
             instants=instants, data=plant.data, offset=plant.offset, shown=plant.shown_data,
             flags=plant.flags, shown_flags=plant.shown_flags,
-            axes=pages.record(self._axes), plant=pages.record(plant),
-            port=pages.record(driver._port) if driver._port else Page.empty(),
+            axes=pages.record(world.axes), plant=pages.record(plant),
+            port=pages.record(world.port) if world.port else Page.empty(),
         )  # fmt: skip
 
     def is_ready(self, watched: bool) -> bool:
         """Tell whether nothing but motion is to be expected."""
-        driver, record = self._driver, self.record
-        if driver._ahead > 1 or driver._found or not self._plant.is_plain:
+        world, record = self._world, self.record
+        if world.ahead > 1 or world.found or not world.plant.is_plain:
             return False
-        if not driver.bank.is_quiet() and not (driver.plan_early() and driver.bank.is_quiet()):
+        if not world.bank.is_quiet() and not (world.plan_early() and world.bank.is_quiet()):
             return False
-        for k, beam in enumerate(driver._beams):
+        for k, beam in enumerate(world.beams):
             if beam.positions is None:
                 return False
             self._beams.broken[k], self._beams.looked_ns = beam.broken, beam.stamp_ns
             for coordinate, position in enumerate(beam.positions):
                 self._beams.before[coordinate] = position
-        record.ahead, record.last_ns, record.found = driver._ahead, driver._last_ns, 0
-        record.still = driver._is_still
-        record.plain, record.idle = not driver._has_effects, driver.bank.is_idle(driver._all)
+        record.ahead, record.last_ns, record.found = world.ahead, world.last_ns, 0
+        record.still = world.is_still
+        record.plain, record.idle = not world.has_effects, world.bank.is_idle(world.all)
         record.may_rest = not watched and record.plain
         return True
 
     def resume(self) -> None:
         """Go on from where the steps have come."""
-        driver, record = self._driver, self.record
-        driver._ahead, driver._last_ns, driver._found = record.ahead, record.last_ns, record.found
-        driver._is_still = bool(record.still)
-        for beam in driver._beams:
+        world, record = self._world, self.record
+        world.ahead, world.last_ns, world.found = record.ahead, record.last_ns, record.found
+        world.is_still = bool(record.still)
+        for beam in world.beams:
             beam.pass_over([self._beams.before[i] for i in range(self._beams.m)], self._beams.looked_ns)
-        driver.bank.after_quiet()
+        world.bank.after_quiet()

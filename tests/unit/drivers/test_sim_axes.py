@@ -343,7 +343,7 @@ def test_a_machine_that_is_too_slow_shows_its_axes_in_slow_motion_and_ends_each_
         bench.clock_ns += 1_000_000
         mod.tick(bench.clock_ns)
         world_ns = mod.blocks[0].stamp_ns
-        assert world_ns == mod.blocks[1].stamp_ns == began_ns + (tick + 1) * mod._stride * 1_000_000
+        assert world_ns == mod.blocks[1].stamp_ns == began_ns + (tick + 1) * mod._world.stride * 1_000_000
         went = float(mod.bank.rows["commanded_position"][0]) - began
         assert went == pytest.approx(0.1 * (world_ns - began_ns) * 1e-9, rel=1e-6)
     mod.make_up_ns = 10**12
@@ -366,15 +366,15 @@ def test_a_machine_that_is_too_slow_for_long_stops_its_axes_and_says_why(bench, 
     for _ in range(12):
         bench.clock_ns += 30_000_000
         bench.run(0.001)
-        assert bench.clock_ns - mod._last_ns <= 230_000_000
-        fastest = max(fastest, abs(mod._servos.velocity[0]))
+        assert bench.clock_ns - mod._world.last_ns <= 230_000_000
+        fastest = max(fastest, abs(mod._world.servos.velocity[0]))
     assert status(mod) & AxisStatus.FAULT
     assert "simulated time is" in mod.bank.fault_text(0) and "at most 200 ms" in mod.bank.fault_text(0)
     mod.make_up_ns = 10**12
     for _ in range(1000):
         bench.run(0.001)
-        fastest = max(fastest, abs(mod._servos.velocity[0]))
-    assert fastest < 0.51 and mod._servos.velocity[0] == 0.0
+        fastest = max(fastest, abs(mod._world.servos.velocity[0]))
+    assert fastest < 0.51 and mod._world.servos.velocity[0] == 0.0
     mod.bank.reset([0])
     bench.write(mod, control_mode=ControlMode.POSITION, position=0.0)
     bench.run(3.0, until=lambda: mod.bank.is_idle([0]))
@@ -406,4 +406,4 @@ def test_what_describe_has_built_goes_to_one_device_of_the_same_settings(bench):
     light_k, heavy_k = devices[1].bank.settings[0].k, devices[0].bank.settings[0].k
     assert [device.bank.settings[0].k for device in devices] == [heavy_k, light_k, light_k, light_k, heavy_k]
     assert heavy_k > 3 * light_k
-    assert len({id(device._servos) for device in devices}) == len(devices), "each has a world of its own"
+    assert len({id(device._world.servos) for device in devices}) == len(devices), "each has a world of its own"

@@ -101,14 +101,14 @@ def test_axes_whose_world_is_gone_are_in_fault_and_sensors_invalid(bench, cell):
     _, arm, sensor, finger = cell
     bench.write(arm, axis=1, control_mode=ControlMode.VELOCITY, velocity=0.1)
     bench.run(0.3)
-    assert arm._servos.velocity[1] == pytest.approx(0.1, abs=0.01)
+    assert arm._world.servos.velocity[1] == pytest.approx(0.1, abs=0.01)
     let_go_of_the_world(bench)
     bench.halted += [sensor, finger]
     bench.run(0.01)
     assert fault(arm).startswith("world.left.x_load: no load is known") and stands(arm)
-    at = arm._servos.position.copy()
+    at = arm._world.servos.position.copy()
     bench.run(0.1)
-    assert stands(arm) and np.array_equal(arm._servos.position, at)
+    assert stands(arm) and np.array_equal(arm._world.servos.position, at)
     for driver in (sensor, finger):
         driver.tick(bench.clock_ns + 1_000_000)
         assert np.all(driver.blocks[0].flags & int(AnalogStatus.INVALID))
@@ -190,7 +190,7 @@ def carrying(bench):
     bench.write(arm, axis=1, control_mode=ControlMode.VELOCITY, velocity=0.05)
     bench.run(0.8)
     assert felt(plane, "normal") > 0.5 and not any(fault(arm, axis) for axis in range(3))
-    assert abs(plane._world.fingers[0].place[2] - arm._servos.position[2]) > 0.01  # the link is bent
+    assert abs(plane._world.fingers[0].place[2] - arm._world.servos.position[2]) > 0.01  # the link is bent
     return plane, arm
 
 
@@ -207,7 +207,7 @@ def fault(arm, axis=0):
 def stands(arm):
     """Tell whether nothing moves, by any measure."""
     rows = arm.bank.rows
-    return not any(np.any(x) for x in (arm._servos.velocity, rows["velocity"], rows["commanded_velocity"]))
+    return not any(np.any(x) for x in (arm._world.servos.velocity, rows["velocity"], rows["commanded_velocity"]))
 
 
 def highest(bench, seconds, *values):
@@ -227,9 +227,9 @@ def test_a_module_stands_when_its_world_is_late_and_holds_on_when_that_goes_on(b
     assert not fault(arm)  # a busy machine
     bench.run(0.02)
     assert "late" in fault(arm) and stands(arm)
-    at = arm._servos.position.copy()
+    at = arm._world.servos.position.copy()
     bench.run(0.5)
-    assert stands(arm) and np.array_equal(arm._servos.position, at)
+    assert stands(arm) and np.array_equal(arm._world.servos.position, at)
     bench.halted.clear()
     normal, turning = highest(bench, 0.3, lambda: felt(plane, "normal"), lambda: plane._world.fingers[0].speed[2])
     assert normal < 1.3 * before and turning < 1.0
@@ -238,40 +238,40 @@ def test_a_module_stands_when_its_world_is_late_and_holds_on_when_that_goes_on(b
     assert highest(bench, 0.3, lambda: felt(plane, "normal"))[0] < 1.3 * before
     bench.write(arm, axis=1, control_mode=ControlMode.VELOCITY, velocity=-0.01)
     bench.run(0.1)
-    assert not fault(arm) and arm._servos.velocity[1] == pytest.approx(-0.01, rel=0.2)
+    assert not fault(arm) and arm._world.servos.velocity[1] == pytest.approx(-0.01, rel=0.2)
 
 
 def test_a_module_that_was_stopped_makes_up_for_nothing_and_shakes_nothing(bench, carrying):
     plane, arm = carrying
-    before, at = felt(plane, "normal"), arm._servos.position.copy()
+    before, at = felt(plane, "normal"), arm._world.servos.position.copy()
     bench.halted.append(arm)
     bench.run(1.5)  # beyond the lease: its world has been standing still for half a second
     assert np.all(plane.blocks[0].flags & int(AnalogStatus.INVALID))
     bench.halted.clear()
-    speeds = [lambda i=i: arm._servos.velocity[i] for i in (0, 1, 2)]
+    speeds = [lambda i=i: arm._world.servos.velocity[i] for i in (0, 1, 2)]
     x, y, th, normal = highest(bench, 0.5, *speeds, lambda: felt(plane, "normal"))
     assert fault(arm) and stands(arm)
     assert x < 0.02 and y < 0.051 and th < 0.5 and normal < 1.3 * before
-    assert arm._servos.position == pytest.approx(at, abs=1e-3)
+    assert arm._world.servos.position == pytest.approx(at, abs=1e-3)
 
 
 def test_a_module_that_was_stopped_for_a_moment_moves_no_further_than_it_brakes(bench, carrying):
     _, arm = carrying
-    at = float(arm._servos.position[1])
+    at = float(arm._world.servos.position[1])
     bench.halted.append(arm)
     bench.run(0.4)  # its world goes on: to it the module stands
     bench.halted.clear()
-    assert highest(bench, 0.5, lambda: arm._servos.velocity[1])[0] < 0.051
-    assert "behind" in fault(arm, 1) and arm._servos.position[1] == pytest.approx(at, abs=1e-3)
+    assert highest(bench, 0.5, lambda: arm._world.servos.velocity[1])[0] < 0.051
+    assert "behind" in fault(arm, 1) and arm._world.servos.position[1] == pytest.approx(at, abs=1e-3)
 
 
 def test_bent_links_push_no_module_that_is_let_go(bench, carrying):
     _, arm = carrying
     arm.bank.fault(np.arange(3), "for a test")
     bench.run(0.02)
-    at = arm._servos.position.copy()
+    at = arm._world.servos.position.copy()
     bench.run(0.5)
-    assert stands(arm) and np.array_equal(arm._servos.position, at)
+    assert stands(arm) and np.array_equal(arm._world.servos.position, at)
 
 
 def test_a_world_that_ticks_seldom_keeps_its_time(bench):

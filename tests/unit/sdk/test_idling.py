@@ -65,14 +65,14 @@ def test_missed_turns_of_a_world_at_rest_need_not_be_made_up() -> None:
             assert periods(world) == (1 if used else 40)
             bank = world.runtime.blocks[0].bank  # type: ignore[attr-defined]
             turns = 0
-            advance = world.runtime.driver._servos.advance  # type: ignore[attr-defined]
+            advance = world.runtime.driver._world.servos.advance  # type: ignore[attr-defined]
 
             def count(force: Any, advance: Any = advance) -> None:
                 nonlocal turns
                 turns += 1
                 advance(force)
 
-            world.runtime.driver._servos.advance = count  # type: ignore[attr-defined]
+            world.runtime.driver._world.servos.advance = count  # type: ignore[attr-defined]
             for _ in range(10):
                 world.tick()
             assert turns <= 20

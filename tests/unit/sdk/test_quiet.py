@@ -18,7 +18,7 @@ MODES = (
 
 
 def test_steps_show_what_the_driver_shows(monkeypatch):
-    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))  # plans are made ahead, whatever the time is
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))  # plans are made ahead at any time
     plain, quiet = Cell(False), Cell(True)
     rng, now_ns, refused = np.random.default_rng(5), 1_000_000_000, 0
     for tick in range(3000):
@@ -53,7 +53,7 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
 
 @pytest.mark.parametrize("at_ms", [300, 570], ids=["as steps", "from an edge on in Python"])
 def test_turns_that_steps_make_up_for_are_shown_each_at_its_time(monkeypatch, at_ms):
-    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))
     cell, now_ns = Cell(True), 1_000_000_000
     cell.tick(now_ns)
     record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
@@ -69,15 +69,15 @@ def test_turns_that_steps_make_up_for_are_shown_each_at_its_time(monkeypatch, at
     assert (cell.quiet > quiet) == (edges == port.edges[0]) == (at_ms == 300)
     for block in cell.driver.blocks:
         record = cell.pages.record(block)
-        assert cell.pages.number(block) >= first + 80 // cell.driver._stride
+        assert cell.pages.number(block) >= first + 80 // cell.driver._world.stride
         words = record.words[32:]
         stamps = [int(words[(n & record.mask) * record.slot + 1]) for n in range(first, cell.pages.number(block) + 1)]
         assert stamps[0] == now_ns - 80 * PERIOD_NS and stamps[-1] == now_ns
-        assert max(np.diff(stamps)) <= cell.driver._stride * PERIOD_NS, "no turn is missing"
+        assert max(np.diff(stamps)) <= cell.driver._world.stride * PERIOD_NS, "no turn is missing"
 
 
 def test_steps_that_have_no_time_leave_turns_to_later_ticks_as_the_driver_does(monkeypatch):
-    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))
     plain, quiet = Cell(False, make_up_ns=0), Cell(True, make_up_ns=0)
     record, now_ns = np.zeros(1, numpy_dtype(NodeClass.AXIS)), 1_000_000_000
     record["control_mode"], record["velocity"] = int(ControlMode.VELOCITY), 0.1
@@ -88,14 +88,14 @@ def test_steps_that_have_no_time_leave_turns_to_later_ticks_as_the_driver_does(m
             if not tick:
                 cell.driver.bank.append(record, range(3), now_ns)
         assert plain.shown() == quiet.shown(), f"tick {tick}"
-        late_ns = now_ns - quiet.driver._last_ns
+        late_ns = now_ns - quiet.driver._world.last_ns
         if tick in (300, 310):
             assert late_ns > 50 * PERIOD_NS
     assert late_ns == 0 and quiet.quiet > 350
 
 
 def test_idle_ticks_by_steps_show_what_those_of_the_driver_show(monkeypatch):
-    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))
     plain, quiet = Cell(False), Cell(True)
     now_ns, idle = 1_000_000_000, 0
     for cell in (plain, quiet):
@@ -125,7 +125,7 @@ def test_who_is_looked_at_or_has_effects_does_not_rest_by_steps():
         cell.rest(now_ns)
     assert cell.rest(now_ns + PERIOD_NS)
     assert not cell.rest(now_ns + 2 * PERIOD_NS, watched=True)
-    cell.driver._has_effects = True
+    cell.driver._world.has_effects = True
     assert not cell.rest(now_ns + 3 * PERIOD_NS)
 
 

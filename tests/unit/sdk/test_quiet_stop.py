@@ -20,7 +20,7 @@ ENDED = AxisStatus.WAITING_SYNCH | AxisStatus.WAITING_MARKER | AxisStatus.MOVING
 @pytest.fixture(autouse=True)
 def _plans(monkeypatch):
     """Plans are made ahead, whatever the time is."""
-    monkeypatch.setattr("sioms.drivers.sim.axes._SLACK_NS", -(10**18))
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))
 
 
 def commands(rng, modes=(ControlMode.POSITION, ControlMode.VELOCITY)):
@@ -35,7 +35,7 @@ def commands(rng, modes=(ControlMode.POSITION, ControlMode.VELOCITY)):
 
 def values(cell, but=frozenset()):
     rows = {name: row.tolist() for name, row in cell.driver.bank.rows.items() if name not in but}
-    return rows, cell.driver._plant.data.tolist()
+    return rows, cell.driver._world.plant.data.tolist()
 
 
 def stop_by_steps(cell, now_ns):
