@@ -20,8 +20,8 @@ from sioms.tactile.calibration import Calibration, Options
 from sioms.tactile.calibration import calibrate as fit
 from sioms.tactile.characterize import creep_of, noise_of, proximity_of, relaxation_of, thermal_of
 from sioms.tactile.closedform import equivalent_radius, indenter_radius
-from sioms.tactile.command import Progress
 from sioms.tactile.command.pictures import poisson_responses
+from sioms.tactile.command.progress import Progress
 from sioms.tactile.estimator import Estimator
 from sioms.tactile.files import Data, read_folder
 from sioms.tactile.finger import Finger, from_toml, to_toml

@@ -12,8 +12,8 @@ from matplotlib.figure import Figure
 
 from sioms.report_page import Page
 from sioms.tactile.closedform import ellipse_spectrum, equivalent_radius
-from sioms.tactile.command import Progress
 from sioms.tactile.command import pictures as draw
+from sioms.tactile.command.progress import Progress
 from sioms.tactile.cylinder import Cylinder, respond
 from sioms.tactile.design import class_difference, conditioning, cutoff, predicted_errors, spacing_needed
 from sioms.tactile.emap import highest_needed

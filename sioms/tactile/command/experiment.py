@@ -11,7 +11,7 @@ import numpy as np
 
 import sioms
 from sioms.report_page import Page
-from sioms.tactile.command import Progress
+from sioms.tactile.command.progress import Progress
 from sioms.tactile.command.tables import calibrated, tables
 from sioms.tactile.finger import to_toml
 from sioms.tactile.live.prober import LENGTH_M, Prober, Touch, write_nominal

@@ -8,7 +8,6 @@ from collections.abc import Callable
 from matplotlib.figure import Figure
 
 from sioms.report_page import Page
-from sioms.tactile.command import Progress
 from sioms.tactile.command import pictures as draw
 from sioms.tactile.command.claims import (
     ANGLES,
@@ -20,6 +19,7 @@ from sioms.tactile.command.claims import (
     chapter_3,
     radii_fitted,
 )
+from sioms.tactile.command.progress import Progress
 from sioms.tactile.cylinder import FINGER_A, FINGER_B, Cylinder
 from sioms.tactile.finger import nominal_finger
 

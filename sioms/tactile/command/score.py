@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sioms.tactile.calibration import Calibration, Options, calibrate
 from sioms.tactile.closedform import equivalent_radius
-from sioms.tactile.command import Progress
+from sioms.tactile.command.progress import Progress
 from sioms.tactile.estimator import Estimator
 from sioms.tactile.files import read_folder
 from sioms.tactile.finger import Finger

@@ -19,7 +19,7 @@ import numpy as np
 
 from sioms.documents import read_text
 from sioms.tactile.chain import StrainFrame
-from sioms.tactile.command import Progress
+from sioms.tactile.command.progress import Progress
 from sioms.tactile.files import read_recording
 from sioms.tactile.finger import Finger, from_toml
 from sioms.tactile.quality import Load, Quality
