@@ -9,18 +9,17 @@ import threading
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from sioms.protocol.flags import Reaction, Severity
 
 from .alarms import OF_CLIENTS, Alarm, AlarmFile, AlarmList
+from .cell import Cell
 from .devices import DriverProcess, State
+from .loading import Plan
 from .names import Node, part_name
 from .realtime import end_promptly
-
-if TYPE_CHECKING:
-    from .loading import Plan
-    from .server import Server
+from .stops import Stops
 
 KEPT_S = 0.1
 """How long a change may wait to be kept [s]."""
@@ -32,12 +31,14 @@ class AlarmKeeper:
     """All alarms of a workcell.
 
     Args:
-        server: the daemon.
+        cell: the workcell.
+        stops: what stops it, or a node.
         path: of the file in which they are kept.
     """
 
-    def __init__(self, server: Server, path: str) -> None:
-        self._server = server
+    def __init__(self, cell: Cell, stops: Stops, path: str) -> None:
+        self._cell = cell
+        self._stops = stops
         self._list = AlarmList(self._changed)
         self._file = AlarmFile(path)
         self._is_kept, self._looks = True, False
@@ -48,7 +49,7 @@ class AlarmKeeper:
         except (OSError, ValueError) as error:
             why = str(error)
         if why:
-            server.log("error", "alarms of before lost", path=path, why=why)
+            cell.log("error", "alarms of before lost", path=path, why=why)
         for alarm in self:  # of all others their drivers tell soon what is the matter now
             if alarm.what == "fault":
                 self.take(alarm.node, alarm.device, "fault", Severity.NONE, "")
@@ -102,15 +103,15 @@ class AlarmKeeper:
 
     def _react(self, device: DriverProcess, reason: str) -> None:
         """Stop what alarms stop that cannot be judged: their driver does not."""
-        server = self._server
+        names = self._cell.names.nodes
         for *_, reaction, name, _ in device.options.get("alarms", ()):
             source = f"alarm of {name}: its driver does not watch it: {reason}"
             nodes: list[Node] = []
             match Reaction(reaction):
                 case Reaction.STOP_WORKCELL:
-                    server.stop_workcell(source)
+                    self._stops.stop_workcell(source)
                 case Reaction.STOP_NODE:
-                    nodes = [server.names.nodes[name]] if name in server.names.nodes else []
+                    nodes = [names[name]] if name in names else []
                 case Reaction.STOP_DEVICE:
                     nodes = [
                         Node(device.name, device.name, i, tuple(range(len(block.channels))), -1, False)
@@ -118,11 +119,11 @@ class AlarmKeeper:
                     ]  # fmt: skip
             for node in nodes:
                 with suppress(OSError):  # it is noted, and holds when the driver is there again
-                    server.stop_node(node, source)
+                    self._stops.stop_node(node, source)
 
     def _changed(self, event: str, alarm: Alarm) -> None:
         by = {"by": alarm.by, "note": alarm.note} if event == "acknowledged" else {}
-        self._server.log(
+        self._cell.log(
             "warning" if event == "raised" else "info", "alarm", device=alarm.device, node=alarm.node, what=alarm.what,
             change=event, severity=Severity(alarm.severity).name.lower(), text=alarm.text, **by,
         )  # fmt: skip
@@ -132,7 +133,7 @@ class AlarmKeeper:
 
     def _look_later(self) -> None:
         self._looks = True
-        self._server.loop.after(KEPT_S, self._look)
+        self._cell.loop.after(KEPT_S, self._look)
 
     def _look(self) -> None:
         """Have kept what has changed, when what was to be kept before is; and look how that ended."""
@@ -161,7 +162,7 @@ class AlarmKeeper:
 
     def _tell(self) -> None:
         if self._failure:
-            self._server.log("error", "not kept", what="alarms", path=self._file.path, why=self._failure)
+            self._cell.log("error", "not kept", what="alarms", path=self._file.path, why=self._failure)
             self._failure = ""
 
     def close(self) -> None:

@@ -7,30 +7,36 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
 
 from sioms.protocol.driver_verbs import Held
 
+from .cell import Cell
+from .devices import DriverProcess
+from .node_verbs import NodeVerbs
 from .rights import Peer
 from .sessions import Refused, Session
-
-if TYPE_CHECKING:
-    from .devices import DriverProcess
-    from .names import NameTable
-    from .node_verbs import NodeVerbs
-    from .server import Server
+from .stops import Stops
 
 
 class Holds:
-    """Handles of devices on nodes of other devices; to the drivers that serve them they are clients as any other."""
+    """Handles of devices on nodes of other devices; to the drivers that serve them they are clients as any other.
 
-    def __init__(self) -> None:
+    Args:
+        cell: the workcell.
+        stops: what stops a node whose driver takes no orders.
+        nodes: who has which open.
+    """
+
+    def __init__(self, cell: Cell, stops: Stops, nodes: NodeVerbs) -> None:
+        self._cell = cell
+        self._stops = stops
+        self._nodes = nodes
         self._sessions: dict[str, Session] = {}
 
-    def look(self, devices: Mapping[str, DriverProcess], names: NameTable, nodes: NodeVerbs) -> None:
+    def look(self) -> None:
         """Give each device what it holds and does not have yet, as far as that is there and free."""
-        for device in devices.values():
+        names = self._cell.names
+        for device in self._cell.devices.values():
             contact = device.contact if device.info.holds else None
             if contact is None:
                 continue
@@ -41,7 +47,7 @@ class Holds:
                 if name in has or node is None:
                     continue
                 try:
-                    held = nodes.hold(session, device.name, node, device.lease_s)
+                    held = self._nodes.hold(session, device.name, node, device.lease_s)
                 except Refused:
                     continue  # its driver is about to be lost; the next look finds another
                 if held is None:
@@ -52,26 +58,26 @@ class Holds:
                     try:
                         device.send(Held(name, channels), [ours.fileno()])
                     except OSError:
-                        nodes.detach(handle)  # the end of the socket here does the same, a little later
+                        self._nodes.detach(handle)  # the end of the socket here does the same, a little later
 
-    def silent(self, device: DriverProcess, name: str, why: str, server: Server) -> None:
+    def silent(self, device: DriverProcess, name: str, why: str) -> None:
         """Stop a node whose driver takes no orders from who holds it, past its handles, and end that handle."""
-        session, node = self._sessions.get(device.name), server.names.nodes.get(name)
+        session, node = self._sessions.get(device.name), self._cell.names.nodes.get(name)
         handles = [h for h in session.handles.values() if h.node.name == name] if session is not None else []
         if node is None or not handles:
             return  # it has been taken from it meanwhile
         try:
-            server.stop_node(node, f"device {device.name}: {why}")
+            self._stops.stop_node(node, f"device {device.name}: {why}")
         except OSError as error:
-            server.log("error", "held node not stopped", node=name, by=device.name, why=error.strerror)
+            self._cell.log("error", "held node not stopped", node=name, by=device.name, why=error.strerror)
         for handle in handles:
-            server.clients.nodes.detach(handle)
+            self._nodes.detach(handle)
 
-    def device_gone(self, device: DriverProcess, nodes: NodeVerbs) -> None:
+    def device_gone(self, device: DriverProcess) -> None:
         """End what a process that is no more has held."""
         session = self._sessions.pop(device.name, None)
         for handle in list(session.handles.values()) if session is not None else ():
-            nodes.detach(handle)
+            self._nodes.detach(handle)
 
     def _session(self, device: DriverProcess, sock: socket.socket, pidfd: int) -> Session:
         session = self._sessions.get(device.name)

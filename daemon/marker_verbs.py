@@ -8,17 +8,17 @@ from __future__ import annotations
 import errno
 import time
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
-from sioms.protocol.markers import MARKERS, MarkerTable
+from sioms.protocol.markers import MARKERS
 from sioms.protocol.messages import refusal, reply
 
+from .cell import Cell
+from .clients import Clients
 from .marker_owners import MarkerError, MarkerOwners, Reservation
 from .rights import Peer
 from .sessions import LATER, Refused, Session, Wait
-
-if TYPE_CHECKING:
-    from .clients import Clients
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,13 +40,14 @@ class MarkerVerbs:
     """Markers on behalf of clients.
 
     Args:
-        table: the shared marker table.
-        clients: who waits and is answered, and the bounds.
+        cell: the workcell: its marker table, and the bounds.
+        clients: who waits and is answered.
     """
 
-    def __init__(self, table: MarkerTable, clients: Clients) -> None:
-        self._table = table
-        self._owners = MarkerOwners(table)
+    def __init__(self, cell: Cell, clients: Clients) -> None:
+        self._cell = cell
+        self._table = cell.shared.markers
+        self._owners = MarkerOwners(self._table)
         self._clients = clients
         self._waits: list[tuple[Reservation, Wait]] = []
 
@@ -60,7 +61,7 @@ class MarkerVerbs:
         if not 1 <= count < MARKERS:
             raise Refused(errno.EINVAL, f"reserve markers: {count} asked for; want 1 to {MARKERS - 1}")
         has = self._owners.count_where(lambda owner: _uid_of(owner) == peer.uid)
-        if why := self._clients.quotas.over(peer, "markers", has, "markers", count):
+        if why := self._cell.quotas.over(peer, "markers", has, "markers", count):
             raise Refused(errno.EBUSY, f"reserve markers: {why}; free some")
         owner = Persisting(peer.uid, peer) if persist else session
         tokens: list[int] = []
@@ -89,6 +90,7 @@ class MarkerVerbs:
             return self._table.stamp_ns(reservation.number)
         wait = self._clients.wait(session, number, timeout_s, f"wait for marker {reservation.number}")
         self._waits.append((reservation, wait))
+        wait.forget = partial(self._forget, wait)
         return LATER
 
     def signalled(self) -> None:
@@ -116,8 +118,8 @@ class MarkerVerbs:
                 for reservation in self._owners.owned_by(owner):
                     self._release(reservation)
 
-    def forget(self, wait: Wait) -> None:
-        """Drop a wait that has ended in another way."""
+    def _forget(self, wait: Wait) -> None:
+        """Drop a wait that has ended."""
         self._waits = [entry for entry in self._waits if entry[1] is not wait]
 
     def _release(self, reservation: Reservation) -> None:

@@ -13,26 +13,25 @@ import socket
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from functools import partial
+from typing import Any
 
 from sioms.protocol.driver_verbs import Attach, Detach
 from sioms.protocol.flags import READONLY, Access, Right
 from sioms.protocol.journal import Note
 from sioms.protocol.messages import refusal, reply
+from sioms.protocol.verbs import Open
 from sioms.wording import did_you_mean
 
+from .cell import Cell
 from .claims import Claims
+from .clients import Clients
 from .devices import DriverProcess, State
 from .names import Claim, Node
 from .rights import in_words
 from .sessions import LATER, Handle, Refused, Session, Wait
 from .suspended import Suspended
-
-if TYPE_CHECKING:
-    from sioms.protocol.verbs import Open
-
-    from .clients import Clients
-    from .server import Server
+from .use import tell_use
 
 _SEND_BUFFER = 1 << 18
 _START_S = 1.5
@@ -47,12 +46,12 @@ class NodeVerbs:
     """Nodes on behalf of clients: who has which open.
 
     Args:
-        server: the daemon: names and devices.
+        cell: the workcell: names and devices.
         clients: who asks, waits and is answered, and what they may.
     """
 
-    def __init__(self, server: Server, clients: Clients) -> None:
-        self._server = server
+    def __init__(self, cell: Cell, clients: Clients) -> None:
+        self._cell = cell
         self._clients = clients
         self._handles: dict[int, Handle] = {}
         self._open: Counter[str] = Counter()
@@ -68,11 +67,11 @@ class NodeVerbs:
         Raises:
             Refused: ENOENT, EACCES.
         """
-        node = self._server.names.nodes.get(name)
+        node = self._cell.names.nodes.get(name)
         if node is None:
             raise Refused(
                 errno.ENOENT,
-                f"{what} of {name}: no such node{did_you_mean(name, self._server.names.nodes)}",
+                f"{what} of {name}: no such node{did_you_mean(name, self._cell.names.nodes)}",
             )
         if not self._clients.rights.on_node(session.peer, node.name) & right:
             raise Refused(
@@ -94,7 +93,7 @@ class NodeVerbs:
         if not 0 <= float(lease_s) <= 3600:
             raise Refused(errno.EINVAL, f"open {name}: lease {lease_s} s; want 0 (none) to 3600")
         open_ones = self._clients.handles_of(session.peer)
-        if why := self._clients.quotas.over(session.peer, "handles", open_ones, "nodes open"):
+        if why := self._cell.quotas.over(session.peer, "handles", open_ones, "nodes open"):
             raise Refused(errno.EMFILE, f"open {name}: {why}; close some")
         obstacle = self._obstacle(node)
         if obstacle is None:
@@ -110,7 +109,7 @@ class NodeVerbs:
 
         def retry() -> None:
             try:
-                if self._server.names.nodes.get(node.name) != node:  # a reload came in between
+                if self._cell.names.nodes.get(node.name) != node:  # a reload came in between
                     why = f"open {name}: it has been removed or changed meanwhile; open it again"
                     raise Refused(errno.EIO, why)
                 self._openable(session, name)
@@ -126,6 +125,7 @@ class NodeVerbs:
                 self._clients.send(session, refusal(number, error.errno, str(error)))
 
         self._opens.append((wait, node, retry))
+        wait.forget = partial(self._forget_open, wait)
         return LATER
 
     def _openable(self, session: Session, name: str) -> Node:
@@ -150,7 +150,7 @@ class NodeVerbs:
             device_of: the device that is to hold it; '' for a client.
         """
         holder = self._claims.holder(node)
-        owner = self._server.names.holder(node)
+        owner = self._cell.names.holder(node)
         if holder is None and owner and owner != device_of:
             return Refused(
                 errno.EBUSY,
@@ -164,13 +164,13 @@ class NodeVerbs:
                 f"open {node.name}: held by {holder.session} for {held_s:.1f} s{other}; use {node.name}{READONLY} to "
                 "observe",
             )
-        device = self._server.devices.get(node.device)
+        device = self._cell.devices.get(node.device)
         if device is None or device.state is not State.UP:
             state, reason = (
                 (device.state.value, device.reason)
                 if device
                 else ("starting", "it has been reloaded")
-                if self._server.is_replaced(node.device)
+                if self._cell.is_replaced(node.device)
                 else ("gone", "no longer configured")
             )
             return Refused(
@@ -180,8 +180,8 @@ class NodeVerbs:
         return None
 
     def _is_starting(self, node: Node) -> bool:
-        device = self._server.devices.get(node.device)
-        return self._server.is_replaced(node.device) or (device is not None and device.state is State.STARTING)
+        device = self._cell.devices.get(node.device)
+        return self._cell.is_replaced(node.device) or (device is not None and device.state is State.STARTING)
 
     def hold(self, session: Session, holder: str, node: Node, lease_s: float) -> tuple[Handle, socket.socket] | None:
         """Give a device a node as its own, if that is free; the caller sends it the socket, and closes it here."""
@@ -192,11 +192,11 @@ class NodeVerbs:
         return handle, ours
 
     def _grant(self, session: Session, number: int, node: Node, access: Access, lease_s: float) -> None:
-        device = self._server.devices[node.device]
+        device = self._cell.devices[node.device]
         handle, ours, readable = self._attach(session, node, access, lease_s)
         try:
             behind = [os.getpid(), device.pid]
-            value = [handle.number, self._server.names.pack(node), node.channels, node.bit, behind]
+            value = [handle.number, self._cell.names.pack(node), node.channels, node.bit, behind]
             self._clients.send(session, reply(number, value), [device.page_fds[node.block], readable, ours.fileno()])
         finally:
             os.close(readable)
@@ -210,7 +210,7 @@ class NodeVerbs:
         Raises:
             Refused: EIO, the driver takes no messages.
         """
-        device = self._server.devices[node.device]
+        device = self._cell.devices[node.device]
         rights = self._clients.rights.on_node(session.peer, node.name)
         now_ns = time.monotonic_ns()
         handle = Handle(next(self._numbers), session, node, access, now_ns, device.generation, rights)
@@ -227,7 +227,7 @@ class NodeVerbs:
                     Attach(
                         handle.number, node.block, node.channels, node.bit, int(access), exclusive,
                         int(rights), math.ceil(lease_s * 1e9), str(session), session.peer.uid,
-                        self._clients.quotas.of_device(session.peer.uid), node.name,
+                        self._cell.quotas.of_device(session.peer.uid), node.name,
                     ),
                     fds,
                 )  # fmt: skip
@@ -237,7 +237,7 @@ class NodeVerbs:
             self._claims.take(handle.claims, handle)
             self._open[node.device] += 1
             if self._open[node.device] == 1:
-                self._server.look_at_use()
+                self.tell_use()
         except BaseException:
             os.close(readable)
             ours.close()
@@ -279,7 +279,7 @@ class NodeVerbs:
         Returns:
             Whether there is a driver to wait for.
         """
-        device = self._server.devices.get(handle.node.device)
+        device = self._cell.devices.get(handle.node.device)
         there = device is not None and device.generation == handle.generation and device.state is State.UP
         if device is not None and there:
             self._order_end(device, handle, 0, "")
@@ -293,7 +293,7 @@ class NodeVerbs:
         for handle in list(self._handles.values()):
             name = handle.node.name
             lost = handle.rights & ~self._clients.rights.on_node(handle.session.peer, name)
-            if self._server.names.nodes.get(name) != handle.node:
+            if self._cell.names.nodes.get(name) != handle.node:
                 self._end(handle, errno.EIO, f"{name}: it has been removed or changed; open it again")
             elif lost:
                 text = f"{name}: the right to {in_words(lost, ', ')} it was taken away; open it again"
@@ -313,11 +313,11 @@ class NodeVerbs:
         for handle in [h for h in self.holders() if h.session.peer.pid in stopped]:
             text = f"{handle.node.name}: its client was stopped, as by Ctrl-Z; open it again"
             if self._end(handle, errno.ETIMEDOUT, text):
-                self._server.log("warning", "client stopped", node=handle.node.name, client=handle.session)
+                self._cell.log("warning", "client stopped", node=handle.node.name, client=handle.session)
 
     def _end(self, handle: Handle, errno_: int, text: str) -> bool:
         """Have a handle end and its client told why; return whether that is news. It cannot get lost."""
-        device = self._server.devices.get(handle.node.device)
+        device = self._cell.devices.get(handle.node.device)
         if handle.ending or device is None or device.generation != handle.generation:
             return False  # the end of a driver process ends its handles
         handle.ending = True
@@ -329,7 +329,7 @@ class NodeVerbs:
             device.send(Detach(handle.number, errno_, text))
         except OSError:
             if device.is_there and device.generation == handle.generation:
-                self._server.loop.after(_AGAIN_S, lambda: self._order_end(device, handle, errno_, text))
+                self._cell.loop.after(_AGAIN_S, lambda: self._order_end(device, handle, errno_, text))
 
     def detached(self, device: DriverProcess, number: int) -> None:
         """The driver has ended a handle: its axes are being halted."""
@@ -341,10 +341,10 @@ class NodeVerbs:
         if self._handles.pop(handle.number, None) is None:
             return
         handle.session.handles.pop(handle.number, None)
-        self._server.shared.journal.note(Note.CLOSED, time.monotonic_ns(), handle.node.name, str(handle.session))
+        self._cell.shared.journal.note(Note.CLOSED, time.monotonic_ns(), handle.node.name, str(handle.session))
         self._open[handle.node.device] -= 1
         if not self._open[handle.node.device]:
-            self._server.look_at_use()
+            self.tell_use()
         self._claims.release(handle.claims)
         wait = handle.session.waits.get(handle.closing)
         if wait is not None:
@@ -367,6 +367,10 @@ class NodeVerbs:
             self._forget(handle)
         self.retry_opens()
 
+    def tell_use(self) -> None:
+        """Tell drivers whether somebody reads them through other devices."""
+        tell_use(self._cell, self.is_open)
+
     def is_open(self, device: str) -> bool:
         """Whether somebody has a node of a device open."""
         return self._open[device] > 0
@@ -375,18 +379,18 @@ class NodeVerbs:
         """Return the handles that own outputs."""
         return (handle for handle in self._handles.values() if handle.claims)
 
-    def forget_wait(self, wait: Wait) -> None:
-        """Drop a waiting open that has ended in another way."""
+    def _forget_open(self, wait: Wait) -> None:
+        """Drop an open that waits no longer."""
         self._opens = [entry for entry in self._opens if entry[0] is not wait]
 
     def listing(self, session: Session) -> list[object]:
         """Return the nodes that the session may read, and who holds them."""
-        names = self._server.names
+        names = self._cell.names
         listed: list[object] = []
         for node in names.nodes.values():
             if self._clients.rights.on_node(session.peer, node.name) & Right.READ:
                 holder = self._claims.holder(node)
-                device = self._server.devices.get(node.device)
+                device = self._cell.devices.get(node.device)
                 state = device.state.value if device else "gone"
                 listed.append([
                     node.name, int(names.block(node).node_class), len(node.channels), node.read_only,

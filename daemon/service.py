@@ -78,7 +78,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: ForkSer
     try:
         loop.run()
     finally:
-        server.shared.files.remove()
+        server.cell.shared.files.remove()
         record.close()
         listening.close()
     return server.exit_status
@@ -159,7 +159,7 @@ def _take_signals(loop: Loop, server: Server) -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
 
     def reloaded(errors: list[str]) -> None:
-        server.log("info", "reload", errors=len(errors))
+        server.cell.log("info", "reload", errors=len(errors))
 
     def take() -> None:
         for number in ours.recv(64):

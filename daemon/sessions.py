@@ -74,6 +74,7 @@ class Wait:
     Attributes:
         what: the request in words.
         why: tells at its time-out what stands in the way.
+        forget: drops it where it is kept; called when it has ended in whatever way.
     """
 
     number: int
@@ -81,6 +82,7 @@ class Wait:
     timer: Timer | None
     what: str
     why: Callable[[], str] | None = None
+    forget: Callable[[], None] = lambda: None
 
 
 @dataclass(slots=True, eq=False)
@@ -113,6 +115,12 @@ class Session:
     def user(self) -> str:
         """Whose it is."""
         return self.peer.user
+
+    def cut(self) -> None:
+        """Tell its client that it may read no journals any more."""
+        if self.leash is not None:
+            self.leash.cut()
+            self.leash = None
 
     def __str__(self) -> str:
         name = f"({self.name})" if self.name and self.peer.key else self.name

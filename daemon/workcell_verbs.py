@@ -1,4 +1,4 @@
-"""Workcell requests of clients: hello, status, emergency stop, reset, reload.
+"""Workcell requests of clients: who speaks, status, reports, journals, reload.
 
 Concurrency: everything runs in the daemon's loop.
 """
@@ -9,36 +9,24 @@ import errno
 import os
 import re
 import time
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable
+from typing import Any, TypeAlias
 
-from sioms.protocol.flags import PROTOCOL_VERSION, Right, Severity
+from sioms.protocol.flags import PROTOCOL_VERSION, Right
 from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import printable
+from sioms.protocol.verbs import Hello, Reload, Report, Represent
 
-from .alarms import OF_CLIENTS, Alarm
-from .devices import State
+from .cell import Cell
+from .clients import Clients
 from .journals import Leash, for_reading
-from .names import part_name, shows
+from .marker_verbs import MarkerVerbs
+from .node_verbs import NodeVerbs
 from .rights import Peer
 from .sessions import LATER, Refused, Session
 
-if TYPE_CHECKING:
-    from sioms.protocol.verbs import (
-        Acknowledge,
-        EmergencyStop,
-        Hello,
-        Reload,
-        Report,
-        Represent,
-        Reset,
-        Supervise,
-        TellAlarm,
-    )  # fmt: skip
-
-    from .clients import Clients
-    from .server import Server
-
-
+Load: TypeAlias = Callable[[Callable[[list[str]], None], Callable[[], bool]], None]
+"""Takes up the configuration anew: called with what takes the errors, and what tells whether it is wanted still."""
 NAMED = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}").fullmatch
 """The name of a key or of a group of keys."""
 
@@ -48,16 +36,22 @@ REPORTS, REPORTED_NS = 16, 3_600_000_000_000
 
 
 class WorkcellVerbs:
-    """The workcell as a whole, and stops, on behalf of clients.
+    """The workcell as a whole, on behalf of clients.
 
     Args:
-        server: the daemon.
+        cell: the workcell.
         clients: who asks, waits and is answered, and what they may.
+        nodes: who has which open.
+        markers: who has how many.
+        load: takes up the configuration anew.
     """
 
-    def __init__(self, server: Server, clients: Clients) -> None:
-        self._server = server
+    def __init__(self, cell: Cell, clients: Clients, nodes: NodeVerbs, markers: MarkerVerbs, load: Load) -> None:
+        self._cell = cell
         self._clients = clients
+        self._nodes = nodes
+        self._markers = markers
+        self._load = load
         self._reports: list[tuple[int, str, str, int, str]] = []
 
     def represent(self, session: Session, message: Represent) -> None:
@@ -76,7 +70,7 @@ class WorkcellVerbs:
             frozenset(groups),
         )  # fmt: skip
         has = sum(other.peer.uid == peer.uid for other in self._clients.sessions)
-        if why := self._clients.quotas.over(peer, "sessions", has, "sessions"):
+        if why := self._cell.quotas.over(peer, "sessions", has, "sessions"):
             raise Refused(errno.EUSERS, f"{what}: {why}")
         session.peer = peer
 
@@ -87,19 +81,19 @@ class WorkcellVerbs:
             raise Refused(errno.EPROTO, f"hello: protocol version {version}; this daemon speaks {PROTOCOL_VERSION}")
         session.name, session.greeted = printable(name, 80), True
         rights = self._clients.rights.on_workcell(session.peer)
-        value = [PROTOCOL_VERSION, self._clients.bounds.name, int(rights)]
-        fds = self._server.shared.files.client_fds if rights & Right.STOP else []
+        value = [PROTOCOL_VERSION, self._cell.bounds.name, int(rights)]
+        fds = self._cell.shared.files.client_fds if rights & Right.STOP else []
         self._clients.send(session, reply(number, value), fds)
         return LATER
 
     def status(self) -> dict[str, object]:
         """Return what `sioms status` shows."""
-        server = self._server
-        server.shared.record.look()
+        cell = self._cell
+        cell.shared.record.look()
         now = time.monotonic_ns()
-        latch = server.shared.latch
+        latch = cell.shared.latch
         return {
-            "workcell": self._clients.bounds.name,
+            "workcell": self._cell.bounds.name,
             "pid": os.getpid(),
             "stopped_ns": latch.stopped_ns,
             "stop_source": latch.source if latch.stopped_ns else "",
@@ -118,16 +112,16 @@ class WorkcellVerbs:
                     "trouble": d.trouble,
                     "age_s": (now - d.started_ns) / 1e9 if d.started_ns else 0.0,
                 }
-                for d in server.devices.values()
+                for d in cell.devices.values()
             ],
             "reports": [
                 [who, (now - at) / 1e9, text] for _, _, who, at, text in self._reports if now - at < REPORTED_NS
             ],
-            "node_stops": server.shared.record.state.nodes(),
+            "node_stops": cell.shared.record.state.nodes(),
             "sessions": [
-                [str(s), len(s.handles), len(s.waits), self._clients.markers.count(s)] for s in self._clients.sessions
+                [str(s), len(s.handles), len(s.waits), self._markers.count(s)] for s in self._clients.sessions
             ],
-            "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._clients.nodes.holders()],
+            "holders": [[h.node.name, str(h.session), (now - h.since_ns) / 1e9] for h in self._nodes.holders()],
         }
 
     def journal(self, session: Session, number: int, device: str) -> Any:
@@ -137,10 +131,10 @@ class WorkcellVerbs:
             raise Refused(
                 errno.EPERM, f"{what}: {session.peer.user} has no right to administer every node; ask for a [[grant]]"
             )
-        process = self._server.devices.get(device)
+        process = self._cell.devices.get(device)
         if device and process is None:
-            raise Refused(errno.ENOENT, f"{what}: no such device; there are: {', '.join(self._server.devices)}")
-        fd = for_reading(self._server.shared.journal.fd if process is None else process.journal_fd)
+            raise Refused(errno.ENOENT, f"{what}: no such device; there are: {', '.join(self._cell.devices)}")
+        fd = for_reading(self._cell.shared.journal.fd if process is None else process.journal_fd)
         try:
             session.leash = session.leash or Leash()
             fds = [fd, session.leash.read_fd]
@@ -159,103 +153,7 @@ class WorkcellVerbs:
         if level != "info":
             kept.append((user, session.name, str(session), now_ns, printable(text, 400)))
         self._reports = kept[-REPORTS:]
-        self._server.log(level, "report", peer=session, text=printable(text, 1000))
-
-    def alarms(self, session: Session) -> list[dict[str, Any]]:
-        """List the alarms on what the session may read."""
-        rights = self._clients.rights
-        return [
-            alarm.packed() for alarm in self._server.alarms if rights.on_node(session.peer, alarm.node) & Right.READ
-        ]  # fmt: skip
-
-    def acknowledge(self, session: Session, message: Acknowledge) -> list[dict[str, Any]]:
-        """Acknowledge the alarms of a node or device, '' = all that the session may."""
-        (name, note), nodes, alarms = message, self._server.names.nodes, self._server.alarms
-        what = f"acknowledge {name or 'all alarms'}"
-        named = self._clients.nodes.find(session, what, name, message.right) if name in nodes else None
-        if name and named is None and name not in self._server.devices:
-            raise Refused(errno.ENOENT, f"{what}: no such node or device; `sioms alarms` lists all alarms")
-        parts, others = list[Alarm](), list[Alarm]()
-        for alarm in alarms:
-            there = nodes.get(alarm.node)
-            if alarm.node == name or (named and there and shows(named, there)):
-                parts.append(alarm)
-            elif name in ("", alarm.device):
-                others.append(alarm)
-        allowed = [a for a in others if self._clients.rights.on_node(session.peer, a.node) & message.right]
-        if named is None and others and not parts + allowed:
-            raise Refused(errno.EPERM, f"{what}: {session.peer.user} has no right to write or administer it")
-        return [alarm.packed() for alarm in alarms.acknowledge(parts + allowed, str(session), note)]
-
-    def tell_alarm(self, session: Session, message: TellAlarm) -> None:
-        """Take what a client says of a condition that it watches."""
-        name, what, severity, text = message
-        where = f"tell an alarm of {name}"
-        node = self._clients.nodes.find(session, "tell an alarm", name, message.right)
-        if what not in OF_CLIENTS:
-            raise Refused(errno.EINVAL, f"{where}: {printable(what, 80)}; want one of: {', '.join(OF_CLIENTS)}")
-        if severity not in (Severity.NONE, Severity.MINOR, Severity.MAJOR):
-            raise Refused(errno.EINVAL, f"{where}: severity {severity}; want 0, 1 (minor) or 2 (major)")
-        if len(node.channels) != 1:
-            raise Refused(errno.EINVAL, f"{where}: it has {len(node.channels)} channels; want the node of one")
-        part = part_name(self._server.names.devices[node.device], node.block, node.channels[0], node.bit)
-        said = f"{printable(text, 300)} [told by {session}]" if severity else ""
-        self._server.alarms.take(part, node.device, what, severity, said)
-
-    def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
-        """Stop the workcell, or a node."""
-        name, why = message
-        source = f"{session}" + (f": {printable(why, 80)}" if why else "")
-        if not name:
-            if not self._clients.rights.on_workcell(session.peer) & message.right:
-                raise Refused(
-                    errno.EPERM,
-                    f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
-                )
-            self._server.hear_request()
-            self._server.stop_workcell(source)
-            return
-        node = self._clients.nodes.find(session, "emergency stop", name, message.right)
-        try:
-            self._server.stop_node(node, source)
-        except OSError as error:
-            raise Refused(errno.EIO, f"emergency stop of {name}: {error.strerror}") from None
-
-    def supervise(self, session: Session, message: Supervise) -> float:
-        """Take a session for a supervisor of the workcell."""
-        if not self._clients.rights.on_workcell(session.peer) & message.right:
-            raise Refused(errno.EPERM, f"supervise: {session.peer.user} has no right to stop; ask for a [[grant]]")
-        if not message.lease_s > 0:
-            raise Refused(errno.EINVAL, f"supervise: lease {message.lease_s:g} s; want more than 0")
-        return self._clients.supervision.renew(session, message.lease_s)
-
-    def reset(self, session: Session, message: Reset) -> None:
-        """Reset the workcell, or a node, or the fault of its device."""
-        (name,) = message
-        if not name:
-            if not self._clients.rights.on_workcell(session.peer) & message.right:
-                raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
-            if self._clients.supervision.missing:
-                raise Refused(errno.EPERM, "reset: the workcell has no supervisor; start `sioms supervise`")
-            if source := self._server.hear_request():
-                raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
-            self._server.reset_workcell(str(session))
-            return
-        node = self._clients.nodes.find(session, "reset", name, message.right)
-        device = self._server.devices.get(node.device)
-        if device is not None and device.state is State.FAULT:
-            device.reset()
-            self._server.log("info", "reset", node=node.name, device=device.name, by=session)
-            return
-        latch = self._server.shared.latch
-        if latch.stopped_ns:
-            raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
-        try:
-            self._server.reset_node(node, str(session))
-        except OSError as error:
-            raise Refused(errno.EIO, f"reset {name}: {error.strerror}") from None
-        if device is not None:
-            device.trouble = ""
+        self._cell.log(level, "report", peer=session, text=printable(text, 1000))
 
     def reload(self, session: Session, number: int, message: Reload) -> Any:
         """Take up the configuration anew, when it has its turn; answered with all errors."""
@@ -278,5 +176,5 @@ class WorkcellVerbs:
 
         check()
         wait = self._clients.wait(session, number, None, "reload")
-        self._server.load(done, begin)
+        self._load(done, begin)
         return LATER

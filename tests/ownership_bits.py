@@ -190,7 +190,7 @@ class BitCell(Cell):
                 process.tick()
             for d in range(2):
                 self.listen(d)
-            self._server.shared.latch.daemon_alive(CLOCK())
+            self._server.cell.shared.latch.daemon_alive(CLOCK())
 
     def ask(self, c: int, verb: ClientVerb, *arguments: object) -> tuple[bool, Any, list[int]]:
         """Ask the daemon; return whether it was done, the answer, and descriptors."""
@@ -208,10 +208,10 @@ class BitCell(Cell):
     def step(self, action: Action) -> str:
         """Take a step; return what was answered."""
         CLOCK.now_ns += 1_000
-        self._server.shared.latch.daemon_alive(CLOCK())
+        self._server.cell.shared.latch.daemon_alive(CLOCK())
         answer = getattr(self, "do_" + action[0])(*action[1:])
         self.settle()
-        self._server.loop._timers.clear()
+        self._server.cell.loop._timers.clear()
         return "" if answer is None else "done" if answer else "refused"
 
     def do_die(self, c: int) -> None:
@@ -300,12 +300,12 @@ class BitCell(Cell):
         """Return the state that it is in."""
         server, runtime = self._server, self._process(1).runtime
         owners = dict.fromkeys(NODES, -1)
-        for handle in server.clients.nodes._handles.values():
+        for handle in server.requests.nodes._handles.values():
             owners[handle.node.name] = (handle.session.peer.pid - FIRST_UID) % CLIENTS
         assert len(runtime.clients.handles) == sum(owner >= 0 for owner in owners.values()), "drivers know the same"
         wanted = int(runtime.driver._wanted)  # type: ignore[attr-defined]
         latched = {bit for _, _, bit in runtime.stops.latched_outputs}
-        reservations = server.clients.markers._owners
+        reservations = server.requests.markers._owners
         whose = [s for s in server.clients.sessions if reservations.owned_by(s)]
         assert len(whose) == sum(owner is not None for owner in reservations.owners()) <= 1
         marker = (-1, False)

@@ -40,7 +40,7 @@ from ownership_fakes import (
     Timer,
     Users,
 )
-from ownership_model import (
+from ownership_state import (
     ABSENT,
     CLIENTS,
     CLOSING,
@@ -63,7 +63,7 @@ from ownership_model import (
 import sioms.daemon.clients
 import sioms.daemon.devices
 import sioms.daemon.loading
-import sioms.daemon.server
+import sioms.daemon.processes
 import sioms.daemon.stop_record
 import sioms.daemon.suspended
 import sioms.sdk.fork_server
@@ -118,12 +118,12 @@ class Cell:
         """Take a step; return what who acted was answered."""
         CLOCK.now_ns += 1_000
         if self.server is not None:
-            self.server.shared.latch.daemon_alive(CLOCK())
+            self.server.cell.shared.latch.daemon_alive(CLOCK())
         answer = getattr(self, str(action[0]))(*action[1:])
         for client in self.clients:
             client.take()
         if self.server is not None:
-            self.server.loop._timers.clear()
+            self.server.cell.loop._timers.clear()
         return answer or ""
 
     def boot(self) -> None:
@@ -152,19 +152,19 @@ class Cell:
         for session in server.clients.sessions:
             session.sock.close()
             os.close(session.pidfd)
-        for device in [*server.devices.values(), *server._leaving.values()]:
+        for device in [*server.cell.devices.values(), *server.cell.leaving.values()]:
             if device._sock is not None:
                 device._sock.close()
                 if device._pidfd >= 0:
                     os.close(device._pidfd)
             for fd in (*device.page_fds, device.journal_fd):
                 os.close(fd)
-        files = server.shared.files
-        for fd in (server.shared.fds[0], server.shared.fds[3], *files.client_fds, record.drivers_fd):
+        files = server.cell.shared.files
+        for fd in (server.cell.shared.fds[0], server.cell.shared.fds[3], *files.client_fds, record.drivers_fd):
             os.close(fd)
-        server.shared.request.close()
+        server.cell.shared.request.close()
         record._journal.close()
-        server.loop.close()
+        server.cell.loop.close()
         self.listener.close()
         self.server = self.record = None
         for process in list(PROCESSES.values()):
@@ -196,7 +196,7 @@ class Cell:
 
     @property
     def _watched(self) -> dict[int, Callable[[], None]]:
-        loop = self._server.loop
+        loop = self._server.cell.loop
         return {**loop._callbacks, **_of_clients(loop.turns)}
 
     def _session(self, c: int) -> Any:
@@ -254,8 +254,8 @@ class Cell:
 
     def suspend(self, c: int) -> None:
         SUSPENDED.add(self.clients[c].pid)
-        self._server.clients.nodes.end_suspended()
-        self._server.clients.nodes.end_suspended()
+        self._server.requests.nodes.end_suspended()
+        self._server.requests.nodes.end_suspended()
         SUSPENDED.clear()
 
     def die(self, c: int, words: int) -> None:
@@ -324,7 +324,7 @@ class Cell:
             for handle in other.runtime.clients.handles.values():
                 handle.heard_ns = CLOCK() if other is not process else handle.heard_ns
         if self.server is not None:
-            self.server.shared.latch.daemon_alive(CLOCK())
+            self.server.cell.shared.latch.daemon_alive(CLOCK())
         else:
             process.runtime.latch.daemon_alive(CLOCK())
         process.tick(1)
@@ -336,7 +336,7 @@ class Cell:
             for handle in other.runtime.clients.handles.values():
                 handle.heard_ns = CLOCK()
         process.tick(1)
-        self._server.shared.latch.daemon_alive(CLOCK())
+        self._server.cell.shared.latch.daemon_alive(CLOCK())
         process.tick(1)
 
     def kill(self, d: int) -> None:
@@ -372,7 +372,7 @@ class Cell:
 
     def _device(self, d: int) -> DriverProcess:
         server = self._server
-        return server.devices.get(NAMES[d]) or server._leaving[NAMES[d]]
+        return server.cell.devices.get(NAMES[d]) or server.cell.leaving[NAMES[d]]
 
     def bury(self, d: int, how: str) -> None:
         device = self._device(d)
@@ -428,7 +428,7 @@ class Cell:
             )
             return model._replace(clients=((OUT, ""),) * CLIENTS, waiting=(), devices=devices)
         self.record.look()  # type: ignore[union-attr]
-        state, latch = server.shared.record.state, server.shared.latch
+        state, latch = server.cell.shared.record.state, server.cell.shared.latch
         assert bool(latch.stopped_ns) == bool(state.workcell), "latch and journal agree"
         stopped_nodes = {name for name, *_ in state.nodes()}
         devices = tuple(self._view_device(d, model) for d in range(DEVICES))
@@ -442,14 +442,14 @@ class Cell:
         assert len(sessions) == sum(at != OUT for at, _ in clients), "no session without a client"
         waiting = tuple(
             ((wait.session.peer.pid - FIRST_UID) % CLIENTS, NAMES.index(wait.what.removeprefix("open ")))
-            for wait, *_ in server.clients.nodes._opens
+            for wait, *_ in server.requests.nodes._opens
         )
         waits = sum(len(s.waits) for s in server.clients.sessions)
         closing = sum(d.claim[1:] == (CLOSING,) for d in devices)
         assert waits == len(waiting) + closing, "nothing waits that nobody answers"
-        handles = server.clients.nodes._handles
+        handles = server.requests.nodes._handles
         assert len(handles) == sum(bool(d.claim) for d in devices), "no handle without an owner"
-        assert len(server.clients.nodes._claims) == len(handles), "nothing is owned without a handle"
+        assert len(server.requests.nodes._claims) == len(handles), "nothing is owned without a handle"
         return State(
             True,
             bool(latch.stopped_ns),
@@ -462,9 +462,9 @@ class Cell:
         )
 
     def _view_request(self) -> int:
-        request = self._server.shared.request
+        request = self._server.cell.shared.request
         mark = request.mark
-        return 0 if mark == self._server._request_seen else 2 if request.taken(mark[0]) else 1
+        return 0 if mark == self._server.stops._request_seen else 2 if request.taken(mark[0]) else 1
 
     def _view_device(self, d: int, model: State) -> Any:
         expected, device = model.devices[d], self._device(d)
@@ -472,7 +472,7 @@ class Cell:
             device.state.value, ABSENT
         )
         claim: Any = ()
-        for handle in self._server.clients.nodes._handles.values():
+        for handle in self._server.requests.nodes._handles.values():
             if handle.node.device != NAMES[d]:
                 continue
             c = (handle.session.peer.pid - FIRST_UID) % CLIENTS
@@ -567,7 +567,7 @@ def cells() -> Iterator[Callable[[], Cell]]:
         patch.setattr(sioms.daemon.clients, "peer_of", _peer_of)
         patch.setattr(sioms.daemon.clients, "pidfd_of", _pidfd_of)
         patch.setattr(sioms.daemon.loading, "ForkServer", ForkServer)
-        patch.setattr(sioms.daemon.server, "ForkServer", ForkServer)
+        patch.setattr(sioms.daemon.processes, "ForkServer", ForkServer)
         patch.setattr(sioms.daemon.stop_record, "_Flusher", Flusher)
         patch.setattr(sioms.daemon.devices, "Patience", Patience)
         patch.setattr(sioms.daemon.suspended, "is_stopped", SUSPENDED.__contains__)

@@ -14,6 +14,13 @@ from typing import NamedTuple
 
 from ownership_cell import Cell, cells
 from ownership_model import (
+    follow,
+)
+from ownership_promises import (
+    Broken,
+    promise,
+)
+from ownership_state import (
     CLIENTS,
     FAULT,
     GUEST,
@@ -21,14 +28,13 @@ from ownership_model import (
     OPEN,
     UP,
     Action,
-    Broken,
     Device,
     Driver,
     Held,
     State,
+)
+from ownership_steps import (
     actions,
-    follow,
-    promise,
 )
 
 BEGINNINGS: dict[str, list[Action]] = {

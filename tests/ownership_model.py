@@ -12,92 +12,40 @@ Pure.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import NamedTuple, TypeAlias
-
-CLIENTS, DEVICES = 3, 2
-GUEST = CLIENTS - 1
-"""The client whose right to write comes and goes with reloads; the others have all rights."""
-Action: TypeAlias = tuple[str | int, ...]
-"""Name of a step, then its client, its device."""
-
-OUT, IN, DEAD = "out", "in", "dead"
-"""A client: without a session; with one; dead, and the daemon has not noticed."""
-LAST_WORDS = ("", "open 0", "open 1", "stop")
-"""What a dying client has sent, and the daemon has not read."""
-ABSENT, STARTING, UP, ENDING, PAUSING, FAULT = "absent", "starting", "up", "ending", "pausing", "fault"
-"""A device, as the daemon sees it; FAULT: its driver has died too often, and waits for a reset."""
-OPEN, CLOSING, TOLD, ORPHAN = "open", "closing", "told", "orphan"
-"""A handle, as the daemon sees it: its client closes it; its driver was told to end it; its session has ended."""
-ATTACH, DETACH, END, STOP, RESET, VOID = "attach", "detach", "end", "stop", "reset", "void"
-"""Messages to a driver; VOID: an order that a later reset of the workcell has overtaken."""
-ORDERS = (STOP, RESET, VOID)
-READY, DETACHED = "ready", "detached"
-NOBODY: tuple[()] = ()
-Held: TypeAlias = tuple[int, str] | tuple[()]
-
-
-class Driver(NamedTuple):
-    """A driver process.
-
-    Attributes:
-        alive: False: killed, and the daemon has not noticed.
-        inbox, outbox: messages of the daemon to it, and from it to the daemon.
-        handle: (client, "dead" when that has died unnoticed) or NOBODY.
-        moves: whether what it owns moves on behalf of its client.
-        node_stop, stopped: what it knows to be stopped.
-        missed: the stop latch has been reset since it looked.
-        asked: the stop-request file has changed since it looked.
-        ending: it has been told to end, or has seen the daemon's end.
-        cut: the daemon has died, which it will hear after all that is in its inbox.
-    """
-
-    alive: bool = True
-    inbox: tuple[tuple[str, int, str], ...] = ()
-    outbox: tuple[str, ...] = ()
-    handle: Held = NOBODY
-    moves: bool = False
-    node_stop: bool = False
-    stopped: bool = False
-    missed: bool = False
-    asked: bool = False
-    ending: bool = False
-    cut: bool = False
-
-
-class Device(NamedTuple):
-    """A device: its phase, the handle that owns it (client, state) or NOBODY, and its processes: at most one."""
-
-    phase: str = ABSENT
-    claim: Held = NOBODY
-    driver: tuple[Driver, ...] = ()
-
-
-class State(NamedTuple):
-    """The whole workcell.
-
-    Attributes:
-        daemon: whether it lives.
-        stopped, node_stops: what has been stopped and not been reset, as every answer said it.
-        request: of the stop-request file: 0: none that the daemon does not know; 1: nobody has heard it; 2: a driver
-            has.
-        guest: whether GUEST may write.
-        clients: each (OUT, IN or DEAD, last words).
-        waiting: opens that wait, the oldest first.
-    """
-
-    daemon: bool = False
-    stopped: bool = False
-    node_stops: tuple[bool, ...] = (False,) * DEVICES
-    request: int = 0
-    guest: bool = True
-    clients: tuple[tuple[str, str], ...] = ((OUT, ""),) * CLIENTS
-    waiting: tuple[tuple[int, int], ...] = ()
-    devices: tuple[Device, ...] = (Device(),) * DEVICES
-
-
-class Broken(AssertionError):
-    """A promise does not hold."""
+from ownership_promises import check, promise
+from ownership_state import (
+    ATTACH,
+    CLIENTS,
+    CLOSING,
+    DEAD,
+    DETACH,
+    DETACHED,
+    DEVICES,
+    END,
+    ENDING,
+    FAULT,
+    GUEST,
+    IN,
+    LAST_WORDS,
+    NOBODY,
+    OPEN,
+    ORDERS,
+    ORPHAN,
+    OUT,
+    PAUSING,
+    READY,
+    RESET,
+    STARTING,
+    STOP,
+    TOLD,
+    UP,
+    VOID,
+    Action,
+    Device,
+    Driver,
+    State,
+    owns,
+)
 
 
 class Step:
@@ -382,7 +330,7 @@ class Step:
         self.clients[c] = (OUT, "")
         self.waiting = [wait for wait in self.waiting if wait[0] != c]
         for d in range(DEVICES):
-            if _owns(self.devices[d], c):
+            if owns(self.devices[d], c):
                 if self.devices[d].phase == UP:
                     self._send(d, DETACH)
                     self._set(d, claim=(c, ORPHAN))
@@ -473,11 +421,6 @@ class Step:
             self.start(d)
 
 
-def _owns(device: Device, c: int) -> bool:
-    """Tell whether a client has a device open, and not only one that had its name before."""
-    return device.claim[:1] == (c,) and device.claim[1] != ORPHAN
-
-
 def follow(state: State, action: Action) -> tuple[State, str]:
     """Take a step; return the state after it, and what who acted was answered.
 
@@ -491,127 +434,3 @@ def follow(state: State, action: Action) -> tuple[State, str]:
         promise(not after.stopped and not after.node_stops[int(action[2])], "what is stopped takes no motion")
     check(after)
     return after, step.answer
-
-
-def actions(s: State) -> Iterator[Action]:
-    """Return all steps that can come next and change something, or are refused."""
-    if not s.daemon and not any(device.driver for device in s.devices):
-        yield ("boot",)
-    for c, (at, _) in enumerate(s.clients):
-        if s.daemon and at == OUT:
-            yield ("connect", c)
-        if at == DEAD:
-            yield ("notice", c, "socket")
-            yield ("notice", c, "process")
-            continue
-        yield from _of_client(s, c, at == IN)
-    for d, device in enumerate(s.devices):
-        yield from _of_driver(s, d, device)
-    if s.daemon:
-        yield ("crash",)
-        yield ("regrant",)
-        if s.request:
-            yield ("beat",)
-
-
-def _of_client(s: State, c: int, connected: bool) -> Iterator[Action]:
-    holds = [d for d in range(DEVICES) if s.devices[d].driver and s.devices[d].driver[0].handle == (c, "")]
-    if connected:
-        for words in range(len(LAST_WORDS)):
-            d = (words - 1) % DEVICES
-            if words in (0, 3) or ((c, d) not in s.waiting and not _owns(s.devices[d], c)):
-                yield ("die", c, words)
-        if any(device.claim == (c, OPEN) and device.phase == UP for device in s.devices):
-            yield ("suspend", c)
-        if not s.stopped:
-            yield ("stop", c)
-        yield ("reset", c)
-    elif holds:
-        yield ("die", c, 0)
-    if s.request != 1 and (connected or not s.daemon):
-        yield ("request_stop", c)
-    for d, device in enumerate(s.devices):
-        if connected:
-            mine = _owns(device, c)
-            if (c, d) in s.waiting:
-                yield ("give_up", c, d)
-            elif not mine:
-                yield ("open", c, d)
-            elif device.claim[1] in (OPEN, TOLD):
-                yield ("close", c, d)
-            if not s.node_stops[d]:
-                yield ("stop_node", c, d)
-            else:
-                yield ("reset_node", c, d)
-        if d in holds:
-            if not device.driver[0].moves:
-                yield ("move", c, d)
-            if not s.node_stops[d]:
-                yield ("stop_by_handle", c, d)
-            else:
-                yield ("reset_by_handle", c, d)
-            yield ("expire", c, d)
-
-
-def _of_driver(s: State, d: int, device: Device) -> Iterator[Action]:
-    for driver in device.driver:
-        if driver.outbox:
-            yield ("listen", d)
-        if not driver.alive:
-            yield ("bury", d, "socket")
-            yield ("bury", d, "process")
-            if device.phase in (STARTING, UP):
-                yield ("fail", d)
-            continue
-        yield ("kill", d)
-        heeds = driver.missed or driver.asked or driver.stopped != s.stopped
-        if driver.inbox or (driver.cut and not driver.ending):
-            yield ("hear", d)
-        if heeds:
-            yield ("tick", d)
-        if driver.handle[1:] == ("dead",):
-            yield ("see_death", d, "socket")
-            yield ("see_death", d, "process")
-        if s.daemon and driver.handle and not driver.ending:
-            yield ("lapse", d)
-        if driver.ending:
-            yield ("leave", d)
-    if device.phase == PAUSING:
-        yield ("start", d)
-    if s.daemon and device.phase in (STARTING, UP, PAUSING, FAULT):
-        yield ("replace", d)
-
-
-# --- promises -------------------------------------------------------------------------------------
-
-
-def promise(holds: object, what: str) -> None:
-    if not holds:
-        raise Broken(what)
-
-
-def check(s: State) -> None:
-    """See that all promises hold in a state.
-
-    Raises:
-        Broken: one does not.
-    """
-    for d, device in enumerate(s.devices):
-        for driver in device.driver:
-            coming = [client for verb, client, _ in driver.inbox if verb == ATTACH]
-            owners = {*driver.handle[:1], *coming}
-            promise(len(owners) + len(coming) <= 2 and len(owners) <= 1, "an output has one owner")
-            if device.phase == UP:
-                promise(owners <= {*device.claim[:1]}, "who owns an output is known to the daemon")
-            promise(not driver.moves or driver.handle, "what nobody owns does not move")
-            promise(
-                not driver.moves or (not driver.stopped and not driver.node_stop),
-                "what is stopped does not move",
-            )
-            held = driver.node_stop or driver.stopped or STOP in [m[0] for m in driver.inbox] or s.stopped
-            promise(not s.node_stops[d] or not driver.alive or driver.ending or held,
-                     "a stop of a node is not lost")  # fmt: skip
-        promise(not device.claim or device.phase in (UP, ENDING), "nobody owns what is not there")
-    for c, d in s.waiting:
-        promise(s.clients[c][0] != OUT, "nobody waits who has gone")
-        promise(s.devices[d].claim or s.devices[d].phase != UP, "what is free is granted")

@@ -97,7 +97,7 @@ def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard(by: str) -> 
             cell.take(action)
         server = cell.server
         assert server is not None
-        note = server.shared.record.note
+        note = server.cell.shared.record.note
 
         def interrupted(entry: Mapping[str, Any]) -> None:
             note(entry)
@@ -106,11 +106,11 @@ def test_a_stop_that_is_asked_for_in_the_middle_of_a_reset_is_heard(by: str) -> 
             else:
                 cell._process(1).runtime.stops.stop_workcell("an input")
 
-        server.shared.record.note = interrupted  # type: ignore[method-assign]
+        server.cell.shared.record.note = interrupted  # type: ignore[method-assign]
         assert cell.take(("reset", 0)) == "done"
-        server.shared.record.note = note  # type: ignore[method-assign]
+        server.cell.shared.record.note = note  # type: ignore[method-assign]
         cell.take(("tick", 0))
-        assert server.shared.latch.stopped_ns, "by a driver that looks"
+        assert server.cell.shared.latch.stopped_ns, "by a driver that looks"
 
 
 @pytest.mark.parametrize("device", [0, 1])
@@ -148,7 +148,7 @@ def test_a_stop_in_the_middle_of_the_reset_of_a_node_is_kept_or_undone_but_never
                     return called
 
                 if by == "daemon":
-                    patch.setattr(server.shared.record, "note", between(server.shared.record.note))
+                    patch.setattr(server.cell.shared.record, "note", between(server.cell.shared.record.note))
                     patch.setattr(DriverProcess, "send", between(DriverProcess.send))
                     patch.setattr(Latch, "ordered", between(Latch.ordered))
                     assert cell.reset_node(2, device) == "done"
@@ -230,7 +230,7 @@ def test_a_stop_that_a_driver_of_an_earlier_daemon_acknowledged_reaches_the_driv
         cell = make()
         for action in begin("nobody owns anything"):
             cell.take(action)
-        record = cell.server.shared.record  # type: ignore[union-attr]
+        record = cell.server.cell.shared.record  # type: ignore[union-attr]
         entries = [
             node_entry("port", "port", "", [(0, 1)], "an orphan's client", stop=True, pid=1),
             node_entry("axis", "axis", "", [(0, 0)], "another", stop=True, pid=1),
@@ -239,11 +239,11 @@ def test_a_stop_that_a_driver_of_an_earlier_daemon_acknowledged_reaches_the_driv
         ]
         for entry in entries:
             StopJournal(os.dup(record.drivers_fd)).append(entry, 0.0)
-        orders = cell.server.shared.latch.orders  # type: ignore[union-attr]
+        orders = cell.server.cell.shared.latch.orders  # type: ignore[union-attr]
         cell.beat()
         cell.tick(1)
         assert [*cell._process(1).runtime.stops.latched_outputs.values()] == ["an orphan's client"]
-        assert cell.server.shared.latch.orders == orders + 1, "of what has been reset, nothing"  # type: ignore[union-attr]
+        assert cell.server.cell.shared.latch.orders == orders + 1, "of what has been reset, nothing"  # type: ignore[union-attr]
 
 
 def test_nothing_of_a_dead_client_is_left() -> None:
@@ -256,7 +256,7 @@ def test_nothing_of_a_dead_client_is_left() -> None:
         client.ask(ClientVerb.RESERVE_MARKER, 3, False)
         session = next(s for s in server.clients.sessions if s.peer.pid == client.pid)
         cell._watched[session.sock.fileno()]()
-        assert server.clients.markers.count(session) == 3
+        assert server.requests.markers.count(session) == 3
         for action in (
             ("die", 0, 0),
             ("hear", 0),
@@ -265,9 +265,9 @@ def test_nothing_of_a_dead_client_is_left() -> None:
             ("listen", 0),
         ):
             cell.take(action)
-        assert server.clients.markers.count(session) == 0
+        assert server.requests.markers.count(session) == 0
         assert not session.waits and not session.handles
-        assert {h.session.peer.user for h in server.clients.nodes.holders()} == {"client1", "client2"}
+        assert {h.session.peer.user for h in server.requests.nodes.holders()} == {"client1", "client2"}
 
 
 def test_the_real_objects_go_with_the_model_for_long() -> None:

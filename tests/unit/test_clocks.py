@@ -11,7 +11,7 @@ TREE = Path(__file__).resolve().parents[2]
 SHOWN = {
     "daemon/alarm_keeper.py": "since when there has been an alarm, and when it was acknowledged",
     "daemon/log.py": "the stamp of a line",
-    "daemon/server.py": "since when something has been stopped, as text",
+    "daemon/stops.py": "since when something has been stopped, as text",
     "daemon/stop_record.py": "since when something has been stopped",
     "drivers/iio/driver.py": "stamps of a kernel that refuses the monotonic clock, brought to that as they come",
     "drivers/iio/simulator.py": "the clock of a simulated converter",

@@ -204,8 +204,8 @@ class Timers:
 def keeper_of(path):
     """Return what keeps the alarms of a daemon, its loop, and what it logs."""
     said, loop = [], Timers()
-    server = SimpleNamespace(loop=loop, log=lambda *text, **fields: said.append((*text, fields.get("why"))))
-    return AlarmKeeper(server, str(path)), loop, said
+    cell = SimpleNamespace(loop=loop, log=lambda *text, **fields: said.append((*text, fields.get("why"))))
+    return AlarmKeeper(cell, None, str(path)), loop, said
 
 
 def test_a_disk_that_hangs_holds_up_no_daemon_and_the_newest_is_kept(tmp_path, monkeypatch):

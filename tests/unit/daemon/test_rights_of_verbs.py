@@ -14,12 +14,15 @@ import pytest
 
 from sioms.daemon import clients as clients_module
 from sioms.daemon.alarm_keeper import AlarmKeeper
+from sioms.daemon.cell import Cell
 from sioms.daemon.clients import Clients
 from sioms.daemon.config import GrantTable, NodeTable, QuotaTable, WorkcellTable
 from sioms.daemon.devices import State
 from sioms.daemon.journals import OwnJournal
+from sioms.daemon.log import Log
 from sioms.daemon.loop import Loop
 from sioms.daemon.names import BlockInfo, DeviceInfo, NameTable
+from sioms.daemon.requests import Requests
 from sioms.daemon.rights import RIGHTS, Peer, Rights
 from sioms.daemon.sessions import Session
 from sioms.daemon.users import Users
@@ -55,8 +58,21 @@ class Device:
             raise OSError(errno.EIO, "takes no messages")
         self.orders.append(message)
 
+    def tell_use(self, used: bool) -> None:
+        """Nothing: no device reads another here."""
+
     def ended(self) -> list[Detach]:
         return [order for order in self.orders if isinstance(order, Detach)]
+
+
+class InOrder(dict[Session, None]):
+    """Sessions in an order that is known."""
+
+    def __init__(self, sessions: Iterator[Session]) -> None:
+        super().__init__(dict.fromkeys(sessions))
+
+    def discard(self, session: Session) -> None:
+        self.pop(session, None)
 
 
 class Workcell:
@@ -68,26 +84,26 @@ class Workcell:
         self.loop = Loop()
         self.loads: list[tuple[Callable[..., None], Callable[[], bool]]] = []
         self.done: list[str] = []
-        self.is_replaced = False
         latch = SimpleNamespace(stopped_ns=0, source="")
         record = SimpleNamespace(look=lambda: None, state=SimpleNamespace(nodes=list))
-        self.server: Any = SimpleNamespace(
-            names=NameTable(INFOS, BITS), devices={"io0": self.device}, loop=self.loop, config=None, starting="",
-            log=lambda *_a, **_k: None, hear_request=str,
-            shared=SimpleNamespace(
-                markers=MarkerTable(memoryview(bytearray(TABLE_SIZE))), latch=latch, record=record,
-                files=SimpleNamespace(client_fds=[]), journal=OwnJournal(),
-            ),
+        shared: Any = SimpleNamespace(
+            markers=MarkerTable(memoryview(bytearray(TABLE_SIZE))), latch=latch, record=record,
+            files=SimpleNamespace(client_fds=[]), journal=OwnJournal(),
+        )  # fmt: skip
+        self.cell = Cell(self.loop, Log(level="error"), shared)
+        self.cell.names, self.cell.devices = NameTable(INFOS, BITS), {"io0": self.device}  # type: ignore[dict-item]
+        stops: Any = SimpleNamespace(
+            hear_request=str,
             stop_workcell=lambda source: self.done.append("stop"),
             reset_workcell=lambda who: self.done.append("reset"),
             stop_node=lambda node, source: self.done.append(f"stop {node.name}"),
             reset_node=lambda node, who: self.done.append(f"reset {node.name}"),
-            load=lambda done, begin: self.loads.append((done, begin)),
-            is_replaced=lambda _name: self.is_replaced, look_at_use=lambda: None,
-        )  # fmt: skip
-        self.server.alarms = AlarmKeeper(self.server, "/nowhere/alarms")
-        self.listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.clients = Clients(self.server, self.listener, "test.sock")
+        )
+        self.alarms = AlarmKeeper(self.cell, stops, "/nowhere/alarms")
+        self.clients = Clients(self.cell)
+        self.requests = Requests(
+            self.cell, self.clients, stops, self.alarms, lambda done, begin: self.loads.append((done, begin)), str
+        )
         self.sessions: dict[str, Session] = {}
         self.ends: dict[str, socket.socket] = {}
         self._number = 0
@@ -99,7 +115,12 @@ class Workcell:
             self.loop.watch(ours.fileno(), lambda: None)
             self.ends[name].setblocking(False)
             whose[ours] = name
-        monkeypatch.setattr(clients_module, "peer_of", lambda sock, _users: self.peers[whose[sock]])
+
+        def peer_of(sock: socket.socket, _users: Users) -> Peer:
+            assert sock.fileno() >= 0, "of an open socket"
+            return self.peers[whose[sock]]
+
+        monkeypatch.setattr(clients_module, "peer_of", peer_of)
 
     def grant(self, *grants: tuple[list[str], str, str]) -> None:
         """Let grants (rights, user, pattern) hold, as a reload does."""
@@ -107,13 +128,13 @@ class Workcell:
         users.uid = {"eva": 1001, "tom": 1002}.get  # type: ignore[method-assign, assignment]
         tables = [GrantTable(list(rights), [user], [], [nodes]) for rights, user, nodes in grants]  # type: ignore[arg-type]
         tables.append(GrantTable(["read"], ["somebody else"]))
-        self.clients.take_up_rights(Rights(tables, 0, users))
-        self.clients.nodes.retry_opens()
+        self.requests.take_up_rights(Rights(tables, 0, users))
+        self.requests.nodes.retry_opens()
 
     def ask(self, who: str, verb: ClientVerb, *arguments: object) -> int | None:
         """Ask for something; return the errno of the answer, None when there is none yet."""
         self._number += 1
-        self.clients._dispatch(self.sessions[who], self._number, FROM_CLIENT[int(verb)].of([*arguments]))
+        self.requests._dispatch(self.sessions[who], self._number, FROM_CLIENT[int(verb)].of([*arguments]))
         return self.answer(who)
 
     def answer(self, who: str) -> int | None:
@@ -132,13 +153,13 @@ class Workcell:
         return self.ask(who, ClientVerb.OPEN, node, int(mode), timeout_s, 0.0)
 
     def detached(self, number: int) -> None:
-        self.clients.nodes.detached(self.device, number)  # type: ignore[arg-type]
+        self.requests.nodes.detached(self.device, number)  # type: ignore[arg-type]
 
     def close(self) -> None:
-        for each in (*self.ends.values(), self.listener, *(s.sock for s in self.sessions.values())):
+        for each in (*self.ends.values(), *(s.sock for s in self.sessions.values())):
             each.close()
         os.close(self.device.page_fds[0])
-        os.close(self.server.shared.journal.fd)
+        os.close(self.cell.shared.journal.fd)
         self.loop.close()
 
 
@@ -233,15 +254,15 @@ def test_a_verb_on_the_workcell_takes_its_right_on_every_node(cell: Workcell, ri
         assert cell.ask("eva", verb, *arguments) == answer, verb
         if verb is ClientVerb.LIST:
             shown = [entry[0] for entry in cell.value]
-            wanted = [n for n in cell.server.names.nodes if fnmatch.fnmatchcase(n, pattern)]
+            wanted = [n for n in cell.cell.names.nodes if fnmatch.fnmatchcase(n, pattern)]
             assert shown == (wanted if granted & Right.READ else [])
 
 
 def test_alarms_are_seen_and_acknowledged_by_who_has_the_rights(cell: Workcell) -> None:
     cell.grant((["read"], "eva", "*"), (["write"], "eva", "io0.bit1"), (["write"], "eva", "grip"))
     for bit in (0, 1):
-        cell.server.alarms.take(f"io0.bit{bit}", "io0", "data", 2, "it reads 1")
-    cell.server.alarms.of_device("io0", "link", "unplugged")
+        cell.alarms.take(f"io0.bit{bit}", "io0", "data", 2, "it reads 1")
+    cell.alarms.of_device("io0", "link", "unplugged")
     assert cell.ask("tom", ClientVerb.ALARMS) == 0 and cell.value == []
     assert cell.ask("eva", ClientVerb.ALARMS) == 0 and len(cell.value) == 3
     assert cell.ask("tom", ClientVerb.ACKNOWLEDGE, "", "") == errno.EPERM
@@ -263,7 +284,7 @@ def test_a_right_that_a_reload_takes_away_ends_the_handle(cell: Workcell, taken:
     assert not cell.device.ended(), "nothing was taken away"
     told: list[str] = []
     cell.grant(([name for name in RIGHTS if name != taken], "eva", "*"))
-    cell.clients.nodes.when_ended(lambda: told.append("ended"))
+    cell.requests.nodes.when_ended(lambda: told.append("ended"))
     assert cell.device.ended() == [
         (number, errno.EACCES, f"{node}: the right to {taken} it was taken away; open it again")
     ]
@@ -325,7 +346,7 @@ def test_a_name_that_shows_something_else_ends_what_was_opened_by_it(cell: Workc
     cell.grant((["read", "write"], "eva", "grip*"))
     assert cell.open("eva", "grip") == 0
     number = cell.value[0]
-    cell.server.names = NameTable(INFOS, {"grip": NodeTable("io0.bit1")})
+    cell.cell.names = NameTable(INFOS, {"grip": NodeTable("io0.bit1")})
     cell.grant((["read", "write"], "eva", "grip*"))
     assert [(a[0], a[1]) for a in cell.device.ended()] == [(number, errno.EIO)]
 
@@ -377,10 +398,10 @@ def test_who_has_left_a_group_is_seen_at_a_reload(cell: Workcell) -> None:
     users.gid = {"lab": 20}.get  # type: ignore[method-assign, assignment]
     cell.peers["eva"] = Peer(1, 1001, "eva", frozenset({20}))
     rights = Rights([GrantTable(["read", "write"], [], ["lab"])], 0, users)
-    cell.clients.take_up_rights(rights)
+    cell.requests.take_up_rights(rights)
     assert cell.open("eva", "io0") == 0
     cell.peers["eva"] = Peer(1, 1001, "eva", frozenset())
-    cell.clients.take_up_rights(rights)
+    cell.requests.take_up_rights(rights)
     assert [arguments[1] for arguments in cell.device.ended()] == [errno.EACCES]
 
 
@@ -389,9 +410,9 @@ def test_what_becomes_free_is_offered_to_who_waits_for_it_alone(
 ) -> None:
     cell.grant((["read", "write"], "eva", "*"), (["read", "write"], "tom", "*"))
     assert cell.open("eva", "io0.bit0") == 0 == cell.open("eva", "io0.bit1")
-    first, second = list(cell.clients.nodes._handles)
+    first, second = list(cell.requests.nodes._handles)
     assert [cell.open("tom", "io0.bit0", None) for _ in range(20)] == [None] * 20
-    nodes, tried = cell.clients.nodes, []
+    nodes, tried = cell.requests.nodes, []
     monkeypatch.setattr(nodes, "_obstacle", lambda node: tried.append(node))
     nodes.detached(cell.device, second)  # type: ignore[arg-type]
     assert not tried
@@ -401,18 +422,19 @@ def test_what_becomes_free_is_offered_to_who_waits_for_it_alone(
 
 def test_an_open_of_a_device_that_is_reloaded_waits_until_it_is_back(cell: Workcell) -> None:
     cell.grant((["read", "write"], "eva", "*"))
-    cell.server.devices = {}
+    cell.cell.devices = {}
     assert cell.open("eva", "io0.bit0") == errno.EIO, "it is no longer configured"
-    cell.is_replaced = True
+    cell.cell.leaving = {"io0": cell.device}  # type: ignore[dict-item]
+    cell.cell.config = SimpleNamespace(devices=INFOS, workcell=WorkcellTable(), quota=QuotaTable())  # type: ignore[assignment]
     assert cell.open("eva", "io0.bit0") is None
-    cell.is_replaced, cell.server.devices = False, {"io0": cell.device}
-    cell.clients.nodes.retry_opens()
+    cell.cell.leaving, cell.cell.devices = {}, {"io0": cell.device}  # type: ignore[dict-item]
+    cell.requests.nodes.retry_opens()
     assert cell.answer("eva") == 0
 
 
 def test_markers_persist_for_users_with_a_right(cell: Workcell) -> None:
     def reserved() -> int:
-        return len(cell.clients.markers._owners.owners())
+        return len(cell.requests.markers._owners.owners())
 
     cell.grant((["read"], "eva", "*"), (["read"], "tom", "*"))
     assert (
@@ -430,7 +452,7 @@ def test_markers_persist_for_users_with_a_right(cell: Workcell) -> None:
 @pytest.fixture
 def gateway(cell: Workcell) -> Workcell:
     """The workcell, where Eva is the user of a gateway."""
-    cell.server.config = SimpleNamespace(workcell=WorkcellTable(gateway_user="eva"), quota=QuotaTable(sessions=1))
+    cell.cell.config = SimpleNamespace(workcell=WorkcellTable(gateway_user="eva"), quota=QuotaTable(sessions=1))  # type: ignore[assignment]
     cell.clients.users.uid = {"eva": 1001}.get  # type: ignore[method-assign, assignment]
     return cell
 
@@ -440,7 +462,7 @@ def _keys(*grants: tuple[list[str], list[str], list[str]]) -> Rights:
 
 
 def test_a_gateway_has_the_rights_of_the_key_that_it_speaks_for_and_no_others(gateway: Workcell) -> None:
-    gateway.clients.take_up_rights(_keys((["read", "write"], [], ["kate"]), (["read"], ["guests"], [])))
+    gateway.requests.take_up_rights(_keys((["read", "write"], [], ["kate"]), (["read"], ["guests"], [])))
     assert gateway.open("eva", "io0") == errno.EACCES
     assert gateway.ask("tom", ClientVerb.REPRESENT, "kate", "lab2", []) == errno.EPERM
     assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == 0
@@ -450,7 +472,7 @@ def test_a_gateway_has_the_rights_of_the_key_that_it_speaks_for_and_no_others(ga
     assert gateway.open("eva", "io0") == 0
     assert str(gateway.sessions["eva"]) == "kate@lab2 through sioms serve (devout)"
     assert gateway.sessions["eva"].peer.uid >= 1 << 32
-    gateway.clients.take_up_rights(_keys((["read"], [], ["kate"])))
+    gateway.requests.take_up_rights(_keys((["read"], [], ["kate"])))
     assert [order[1] for order in gateway.device.ended()] == [errno.EACCES]
 
 
@@ -479,9 +501,25 @@ def test_a_key_has_the_quotas_of_a_user_of_its_own(gateway: Workcell) -> None:
 
 def test_sessions_of_keys_end_when_their_gateway_is_none_any_more(gateway: Workcell) -> None:
     assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == 0
-    gateway.server.config = SimpleNamespace(workcell=WorkcellTable(), quota=QuotaTable())
-    gateway.clients.take_up_rights(_keys())
+    gateway.cell.config = SimpleNamespace(workcell=WorkcellTable(), quota=QuotaTable())  # type: ignore[assignment]
+    gateway.requests.take_up_rights(_keys())
     assert gateway.sessions["eva"] not in gateway.clients.sessions
+
+
+def test_a_session_that_ends_while_rights_are_taken_up_is_asked_nothing_more(gateway: Workcell) -> None:
+    """Its client reads no answers, and one comes: the marker that it waits for is freed with the key's session."""
+    assert gateway.ask("eva", ClientVerb.REPRESENT, "kate", "lab2", []) == 0
+    assert gateway.ask("eva", ClientVerb.RESERVE_MARKER, 1, False) == 0
+    (token,) = gateway.value
+    assert gateway.ask("tom", ClientVerb.WAIT_MARKER, token, None) is None
+    with pytest.raises(BlockingIOError):
+        while True:
+            gateway.sessions["tom"].sock.send(bytes(1024), socket.MSG_DONTWAIT)
+    gateway.sessions["tom"].sock.setblocking(False)
+    gateway.cell.config = SimpleNamespace(workcell=WorkcellTable(), quota=QuotaTable())  # type: ignore[assignment]
+    gateway.clients.sessions = InOrder(gateway.sessions[name] for name in ("eva", "tom"))  # type: ignore[assignment]
+    gateway.requests.take_up_rights(_keys())
+    assert not gateway.clients.sessions
 
 
 def test_a_client_tells_drifts_of_single_channels_and_nothing_else(cell: Workcell) -> None:
@@ -491,7 +529,7 @@ def test_a_client_tells_drifts_of_single_channels_and_nothing_else(cell: Workcel
         return cell.ask("eva", ClientVerb.TELL_ALARM, *arguments)
 
     assert tell("io0", "drift", 1, "worn") == 0
-    (alarm,) = cell.server.alarms
+    (alarm,) = cell.alarms
     assert (alarm.node, alarm.what, alarm.severity) == ("io0", "drift", 1)
     assert alarm.text == "worn [told by pid 1 (eva)]"
     for what in ("fault", "link", "driver", "data", ""):  # what drivers and the daemon tell is theirs
@@ -499,4 +537,4 @@ def test_a_client_tells_drifts_of_single_channels_and_nothing_else(cell: Workcel
     for severity in (-1, 3, 4, 1 << 40):
         assert tell("io0", "drift", severity, "") == errno.EINVAL
     assert tell("nowhere", "drift", 1, "") == errno.ENOENT
-    assert tell("io0", "drift", 0, "") == 0 and [a.state for a in cell.server.alarms] == ["returned"]
+    assert tell("io0", "drift", 0, "") == 0 and [a.state for a in cell.alarms] == ["returned"]

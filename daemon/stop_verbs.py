@@ -1,0 +1,93 @@
+"""Requests of clients to stop, to reset what is stopped, and to supervise.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import errno
+
+from sioms.protocol.text import printable
+from sioms.protocol.verbs import EmergencyStop, Reset, Supervise
+
+from .cell import Cell
+from .clients import Clients
+from .devices import State
+from .node_verbs import NodeVerbs
+from .sessions import Refused, Session
+from .stops import Stops
+from .supervision import Supervision
+
+
+class StopVerbs:
+    """Stops on behalf of clients.
+
+    Args:
+        cell: the workcell.
+        clients: what they may.
+        stops: what stops the workcell and nodes.
+        nodes: finds nodes for who asks.
+        supervision: who supervises.
+    """
+
+    def __init__(self, cell: Cell, clients: Clients, stops: Stops, nodes: NodeVerbs, supervision: Supervision) -> None:
+        self._cell = cell
+        self._clients = clients
+        self._stops = stops
+        self._nodes = nodes
+        self._supervision = supervision
+
+    def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
+        """Stop the workcell, or a node."""
+        name, why = message
+        source = f"{session}" + (f": {printable(why, 80)}" if why else "")
+        if not name:
+            if not self._clients.rights.on_workcell(session.peer) & message.right:
+                raise Refused(
+                    errno.EPERM,
+                    f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
+                )
+            self._stops.hear_request()
+            self._stops.stop_workcell(source)
+            return
+        node = self._nodes.find(session, "emergency stop", name, message.right)
+        try:
+            self._stops.stop_node(node, source)
+        except OSError as error:
+            raise Refused(errno.EIO, f"emergency stop of {name}: {error.strerror}") from None
+
+    def supervise(self, session: Session, message: Supervise) -> float:
+        """Take a session for a supervisor of the workcell."""
+        if not self._clients.rights.on_workcell(session.peer) & message.right:
+            raise Refused(errno.EPERM, f"supervise: {session.peer.user} has no right to stop; ask for a [[grant]]")
+        if not message.lease_s > 0:
+            raise Refused(errno.EINVAL, f"supervise: lease {message.lease_s:g} s; want more than 0")
+        return self._supervision.renew(session, message.lease_s)
+
+    def reset(self, session: Session, message: Reset) -> None:
+        """Reset the workcell, or a node, or the fault of its device."""
+        (name,) = message
+        if not name:
+            if not self._clients.rights.on_workcell(session.peer) & message.right:
+                raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
+            if self._supervision.missing:
+                raise Refused(errno.EPERM, "reset: the workcell has no supervisor; start `sioms supervise`")
+            if source := self._stops.hear_request():
+                raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
+            self._stops.reset_workcell(str(session))
+            return
+        node = self._nodes.find(session, "reset", name, message.right)
+        device = self._cell.devices.get(node.device)
+        if device is not None and device.state is State.FAULT:
+            device.reset()
+            self._cell.log("info", "reset", node=node.name, device=device.name, by=session)
+            return
+        latch = self._cell.shared.latch
+        if latch.stopped_ns:
+            raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
+        try:
+            self._stops.reset_node(node, str(session))
+        except OSError as error:
+            raise Refused(errno.EIO, f"reset {name}: {error.strerror}") from None
+        if device is not None:
+            device.trouble = ""

@@ -1,0 +1,185 @@
+"""Stops of the workcell and of nodes: latched, kept, passed on to drivers, and reset.
+
+What a stop is and why it outlives everything: docs/decisions/0140-a-stop-outlives-everything.md.
+
+Concurrency: everything runs in the daemon's loop.
+"""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+from sioms.protocol import driver_verbs
+from sioms.protocol.stopjournal import NODE, PID, node_entry, parts_of, workcell_entry
+
+from .cell import Cell
+from .devices import DriverProcess
+from .names import Node
+
+
+class Stops:
+    """What stops, and what keeps it stopped.
+
+    Args:
+        cell: the workcell.
+    """
+
+    def __init__(self, cell: Cell) -> None:
+        self._cell = cell
+        self._shared = cell.shared
+        self._request_seen = self._shared.request.mark
+
+    def restore(self) -> None:
+        """Be stopped from the beginning when it was so at the end."""
+        stopped = self._shared.record.state
+        if stopped.workcell:
+            since = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(stopped.since_s))
+            self._shared.latch.stop(time.monotonic_ns(), f"{stopped.workcell} (since {since})")
+            self._cell.log("warning", "still stopped", source=self._shared.latch.source)
+        for node, source in stopped.nodes():
+            self._cell.log("warning", "still stopped", node=node, source=source)
+        if self._shared.files.unheard:
+            self.stop_workcell(self._shared.files.unheard)
+
+    def stop_workcell(self, source: str) -> None:
+        """Latch the emergency stop, wake every driver, and keep it."""
+        latch = self._shared.latch
+        known = not latch.stop(time.monotonic_ns(), source) and not (
+            latch.source == self._shared.request.source != source
+        )
+        if not known:
+            self._cell.log("warning", "emergency stop", source=source)
+            latch.name_source(source)  # drivers see the request page before the message that says who
+        for device in self._cell.devices.values():
+            device.tell(driver_verbs.StopChanged())
+        self._shared.record.look()
+        if not known or not self._shared.record.state.workcell:
+            self._note(workcell_entry(source, stop=True, named=True, latched_ns=latch.stopped_ns))
+
+    def hear_request(self) -> str:
+        """Obey the stop-request file; return who has asked for a stop that nobody had heard yet, '' for nobody.
+
+        A client that could not reach us has asked the drivers directly; they have acted already, as a rule.
+        """
+        request = self._shared.request
+        if (mark := request.mark) == self._request_seen:
+            return ""
+        self._request_seen = mark
+        source, heard = request.source, request.taken(mark[0])
+        self.stop_workcell(source)
+        request.take(mark)
+        return "" if heard else source
+
+    def reset_workcell(self, who: str) -> None:
+        """Clear the latch and give devices in fault another try; nothing moves by itself."""
+        latched_ns = self._shared.latch.stopped_ns
+        self._note(workcell_entry(who, stop=False, latched_ns=latched_ns))  # first: a later stop is noted after it
+        self._shared.latch.reset(self._request_seen)  # what has been asked for since then has not been heard
+        self._cell.log("warning", "reset", by=who)
+        for device in self._cell.devices.values():
+            device.trouble = ""
+            device.tell(driver_verbs.StopChanged())
+            device.reset()
+        for device in self._cell.devices.values():
+            self.look_at_inputs(device)  # as one that is still pressed, it stops the workcell again
+
+    def stop_node(self, node: Node, source: str) -> None:
+        """Stop a node and keep that; one whose driver is not there starts stopped.
+
+        Raises:
+            OSError: EIO, its driver takes no messages: it will be stopped when it is started again.
+        """
+        try:
+            self._order(node, driver_verbs.NodeStop, source)
+        finally:
+            self._note(self._node_entry(node, source, stop=True))
+            self._cell.log("warning", "emergency stop", node=node.name, source=source)
+
+    def reset_node(self, node: Node, who: str) -> None:
+        """Clear the stop and the faults of a node.
+
+        The reset is noted first: a stop that its driver takes after the reset, and notes by itself, is noted after it.
+
+        Raises:
+            OSError: EIO, its driver takes no messages.
+        """
+        record = self._shared.record
+        record.look()
+        before = [entry for entry in record.state.entries() if entry.get("device") == node.device]
+        self._note(self._node_entry(node, who, stop=False))
+        try:
+            self._order(node, driver_verbs.NodeReset, who)
+        except OSError:
+            for entry in before:
+                self._note(entry)
+            raise
+        self._cell.log("warning", "reset", node=node.name, by=who)
+
+    def _order(self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str) -> None:
+        device = self._cell.devices.get(node.device) or self._cell.leaving.get(node.device)
+        if device is not None and device.is_there:
+            device.send(order(node.block, node.channels, node.bit, source, self._shared.latch.resets))
+            self._shared.latch.ordered()
+
+    def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:
+        block = self._cell.names.devices[node.device].blocks[node.block]
+        parts = [
+            part for c in node.channels for part in parts_of(c, node.bit, block.channels[c].width)
+        ]  # fmt: skip
+        return node_entry(node.name, node.device, block.name, parts, source, stop=stop)
+
+    def _note(self, entry: dict[str, Any]) -> None:
+        try:
+            self._shared.record.note(entry)
+        except OSError as error:
+            self._cell.log("error", "not kept", what=str(entry), path=self._shared.record.path, why=error.strerror)
+
+    def stopped_of(self, device: str) -> list[list[Any]]:
+        """Return what of a device is stopped and must be so from its driver's start."""
+        record = self._shared.record
+        record.look()
+        record.by_drivers = [entry for entry in record.by_drivers if entry.get("device") != device]
+        return self._shared.record.state.of_device(device)
+
+    def _pass_on_stops(self) -> None:
+        """Send on the stops of nodes that drivers have acknowledged which are not ours, as of a daemon before us.
+
+        Only stops: what such a driver resets, it resets for itself.
+        """
+        record = self._shared.record
+        entries, record.by_drivers = record.by_drivers, []
+        for entry in entries:
+            device = self._cell.devices.get(str(entry.get("device")))
+            if device is None or not device.is_there or device.pid == entry[PID]:
+                continue
+            channels_of: dict[tuple[int, int], list[int]] = {}
+            for _, name, channel, bit in record.state.still(entry):
+                number = next((i for i, block in enumerate(device.info.blocks) if block.name == name), -1)
+                if number >= 0 and channel < len(channels := device.info.blocks[number].channels):
+                    channels_of.setdefault((number, bit if channels[channel].width else -1), []).append(channel)
+            for (number, bit), stopped in channels_of.items():
+                device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), self._shared.latch.resets))
+                self._shared.latch.ordered()
+            self._cell.log("warning", "emergency stop", node=entry[NODE], source=entry["by"], heard_by=entry[PID])
+
+    def stopped(self, device: DriverProcess, source: str) -> None:
+        """Wake the other drivers: one has latched the stop of the workcell."""
+        self._cell.log("warning", "emergency stop", source=source, device=device.name)
+        for other in self._cell.devices.values():
+            other.tell(driver_verbs.StopChanged())
+
+    def look_at_inputs(self, device: DriverProcess) -> None:
+        """Stop the workcell when an input of a device that is to stop it cannot be read: it may be pressed."""
+        for block, node in self._cell.watched_inputs.get(device.name, {}).items():
+            if why := device.why_unreadable(block):
+                self.stop_workcell(f"input {node} stops the workcell, and it cannot be read: {why}")
+                return
+
+    def look(self) -> None:
+        """Take up what has been asked for and noted by others since the last look."""
+        self.hear_request()
+        self._shared.record.look()
+        if (source := self._shared.record.state.workcell) and not self._shared.latch.stopped_ns:
+            self.stop_workcell(source)  # a driver could not keep a stop
+        self._pass_on_stops()
