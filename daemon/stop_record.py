@@ -74,9 +74,15 @@ class StopRecord:
 
     def look(self) -> None:
         """Take into account what drivers have noted."""
+        if self._take() and self._at - self._checked_at > MOST_BYTES:
+            with contextlib.suppress(OSError):  # the next entry tells
+                self._check()
+
+    def _take(self) -> bool:
+        """Read what has been appended; return whether there was anything."""
         size = os.fstat(self._fd).st_size
         if size == self._at:
-            return
+            return False
         if size < self._at:
             self.state.take(None, "it has been truncated", time.time())
             self._at = size
@@ -88,9 +94,7 @@ class StopRecord:
                 self.by_drivers.append(entry)
         if read:
             self._flusher.flush()
-        if self._at - self._checked_at > MOST_BYTES:
-            with contextlib.suppress(OSError):  # the next entry tells
-                self._check()
+        return True
 
     def note(self, entry: Mapping[str, Any]) -> None:
         """Note a stop or a reset.
@@ -120,9 +124,9 @@ class StopRecord:
         """Append a checkpoint, and free what is not needed any more."""
         at = self._at
         self._journal.append({CHECKPOINT: self.state.entries(), "from": at}, time.time())
-        self._checked_at = at
         self._flusher.flush(at)
-        self.look()
+        self._take()
+        self._checked_at = self._at  # behind the checkpoint, however long that is
 
 
 class _Flusher:
