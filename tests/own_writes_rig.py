@@ -10,6 +10,7 @@ import _socket
 import importlib.util
 import os
 import random
+import select
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -47,6 +48,8 @@ from sioms.sdk.runtime import Runtime
 from sioms.sdk.settings import LineSettings
 
 SEED = int(os.environ.get("SIOMS_SEED", "0"))
+CONTROL = 3
+"""The daemon's socket among the descriptors that are ready."""
 Done = Callable[[Any], None]
 
 
@@ -225,14 +228,20 @@ class World:
             module.set_timer = lambda fd, when_ns: 0
             self.run_quietly = module.run
             return QuietRun(
-                steps, 0, 1, 2, runtime._latch_words, runtime.period_ns, runtime._lead_ns, runtime._daemon_lease_ns,
-                runtime._idling, instants, runtime.pages, runtime.stops, runtime.waits, runtime.clients,
-                runtime.statistics,
+                steps, 0, 1, 2, CONTROL, runtime._latch_words, runtime.period_ns, runtime._lead_ns,
+                runtime._daemon_lease_ns, runtime._idling, instants, runtime.pages, runtime.stops, runtime.waits,
+                runtime.clients, runtime.statistics,
             )  # fmt: skip
 
     def _wait_for(self, poll: int, ready: Any, timeout_ms: int) -> int:
-        """Say that a timer is due, until that has been heard; then that a signal has ended the wait."""
+        """Say that a timer is due, until that has been heard; then that a signal has ended the wait.
+
+        Who does not wait asks whether the daemon has sent something.
+        """
         assert self._run is not None
+        if timeout_ms == 0:
+            ready[0] = CONTROL
+            return len(select.select([self.runtime._control], [], [], 0)[0])
         ready[0] = 1 if self.runtime._timer.expired else 2  # type: ignore[attr-defined]
         return 1 if ready[0] == 1 or self._run.record.announced else 0
 

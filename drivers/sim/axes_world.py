@@ -156,9 +156,12 @@ class AxesWorld:
             self.bank.plan_ahead(_PLANS)
 
     def plan_early(self) -> bool:
-        """Plan profiles ahead long before the next tick; return whether there were any."""
-        until_ns = self.last_ns + self.tick_ns
-        return until_ns - time.monotonic_ns() > 2 * _SLACK_NS and self.bank.plan_ahead(_PLANS) > 0
+        """Plan profiles ahead long before the next tick, or when that is late anyway; return whether there were any.
+
+        Without the plans the late tick, and all after it, would be the loop's, and later still.
+        """
+        left_ns = self.last_ns + self.tick_ns - time.monotonic_ns()
+        return not 0 <= left_ns <= 2 * _SLACK_NS and self.bank.plan_ahead(_PLANS) > 0
 
     def is_at_rest(self) -> bool:
         """Whether world and command are at a fixed point; turns that are left out then need not be made up for."""

@@ -15,6 +15,7 @@ from typing import Any
 
 from sioms.check.daemon import CpuTimes, Daemon, memory_kb
 from sioms.client.command import command
+from sioms.protocol.flags import AxisStatus
 
 from .baseline import interpreter_ns
 from .deaths import SPEED, wait_cruising
@@ -116,7 +117,7 @@ def _ticks(nodes: list[Any]) -> tuple[int, int]:
 
 
 def _axes_in_fault(nodes: list[Any]) -> int:
-    return sum(any(node.read().fault) for node in nodes)
+    return sum(any(status & AxisStatus.FAULT for status in node.read().status) for node in nodes)
 
 
 def _stops(options: Options, report: Report, cell: Any, nodes: list[Any]) -> None:

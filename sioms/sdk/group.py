@@ -29,7 +29,7 @@ from sioms.protocol.verbs import take
 
 from .finding import find_driver, read_settings
 from .quiet import QuietRun
-from .quiet_step import Many, begin_stop, heed_one, run_many
+from .quiet_step import Many, begin_stop, heed_one, run_many, wait_turn
 from .rt import ChangeWatch, name_process, settle
 from .runtime import Runtime
 
@@ -41,6 +41,8 @@ PAUSE_S = 50e-6
 """After each device that has come, and after each few that have been served in a row: a process in a real-time class
 must not work for long without a pause."""
 IN_A_ROW = 8
+FAIR = 4
+"""One turn in so many is of those that can wait, however many cannot."""
 
 
 @dataclass(slots=True)
@@ -80,7 +82,11 @@ class Group:
         self._built: deque[Member] = deque()
         self._due: dict[int, None] = {}
         """Who has more to do than to tick, by descriptor: one after another, the others tick in between."""
-        self._in_a_row = 0
+        self._urgent: dict[int, None] = {}
+        """Who goes before them: whose tick is the loop's, who has yet to begin a stop, whom the daemon calls."""
+        self._pauses: dict[int, float] = {}
+        """After how long members have to be served without an event."""
+        self._turns = 0
         self._requests: ChangeWatch | None = None
         self._is_settled = False
         self._of = np.zeros(MOST_FILES, dtype=np.int64)
@@ -105,8 +111,9 @@ class Group:
 
     def _wait(self) -> list[int]:
         """Return the descriptors that are ready; those of members who have more to do are."""
-        pauses = {fd: pause for fd, m in self._members.items() if (pause := m.runtime.pause_s) is not None}
-        timeout_s = 0.0 if self._built or self._due else min(pauses.values(), default=None)
+        pauses = self._pauses
+        is_waited_for = self._built or self._due or self._urgent
+        timeout_s = 0.0 if is_waited_for else min(pauses.values(), default=None)
         if library is None:
             found = [fd for fd, _ in self._epoll.poll(timeout_s)]
         else:
@@ -117,20 +124,27 @@ class Group:
     def _put(self, fd: int) -> None:
         """Have a member served soon; until then it ticks on, unless the tick itself is what there is to be served."""
         quiet = self._members[fd].quiet
-        if quiet is not None and (quiet.record.left or quiet.record.slackens):
+        if quiet is not None and not wait_turn(quiet.record):
+            if not quiet.record.called:
+                if fd not in self._urgent:
+                    self._due.setdefault(fd)
+                return
+        else:
             self._of[fd] = 0
-        self._due.setdefault(fd)
+        self._due.pop(fd, None)
+        self._urgent.setdefault(fd)
 
     def _serve_next(self) -> None:
         """Serve the member whose turn it is."""
-        if not self._due:
+        if not self._due and not self._urgent:
             return
-        fd = next(iter(self._due))
-        del self._due[fd]
+        self._turns += 1
+        can_wait = not self._urgent or (self._due and self._turns % FAIR == 0)
+        whose = self._due if can_wait else self._urgent
+        fd = next(iter(whose))
+        del whose[fd]
         self._serve(fd, self._members[fd])
-        self._in_a_row += 1
-        if self._in_a_row >= IN_A_ROW:
-            self._in_a_row = 0
+        if self._turns % IN_A_ROW == 0:
             time.sleep(PAUSE_S)
 
     # --- devices ---------------------------------------------------------------------------------
@@ -214,12 +228,16 @@ class Group:
         self._guarded(member, lambda: self._lend(fd, member))
         if not member.runtime.running:
             del self._members[fd]
-            self._due.pop(fd, None)
+            for waiting in (self._due, self._urgent, self._pauses):
+                waiting.pop(fd, None)
             self._epoll.unregister(fd)
             member.runtime.release()
             _close(member.fds)
 
     def _lend(self, fd: int, member: Member) -> None:
+        self._pauses.pop(fd, None)
+        if (pause_s := member.runtime.pause_s) is not None:
+            self._pauses[fd] = pause_s
         member.quiet = member.runtime.lend()
         if member.quiet is not None:
             self._of[fd] = member.quiet.record.address
@@ -243,13 +261,18 @@ class Group:
         for fd, member in list(self._members.items())[:1]:
             self._serve(fd, member)  # which puts the stop into the latch
         now_ns = time.monotonic_ns()
-        owing = {fd: self._brakes(member, now_ns) for fd, member in self._members.items() if member.owes}
-        braking = [fd for fd, brakes in owing.items() if brakes]
-        self._due = dict.fromkeys([fd for fd, brakes in owing.items() if not brakes] + [*self._due] + braking)
+        owing = {fd: self._is_stopped(member, now_ns) for fd, member in self._members.items() if member.owes}
+        for fd, is_stopped in owing.items():
+            if not is_stopped:
+                self._due.pop(fd, None)
+            elif fd not in self._urgent:
+                self._due.setdefault(fd)
+        self._urgent = dict.fromkeys([*(fd for fd, is_stopped in owing.items() if not is_stopped), *self._urgent])
 
-    def _brakes(self, member: Member, now_ns: int) -> bool:
-        """Have a member begin its stop by steps; return whether it has."""
-        return member.quiet is not None and begin_stop(member.quiet.record, now_ns) == 0
+    def _is_stopped(self, member: Member, now_ns: int) -> bool:
+        """Have a member begin its stop by steps; return whether it has, or has been stopped before."""
+        quiet = member.quiet
+        return quiet is not None and (quiet.record.stopped != 0 or begin_stop(quiet.record, now_ns) == 0)
 
 
 def _close(fds: list[int]) -> None:

@@ -31,7 +31,7 @@ class QuietRun:
 
     Args:
         steps: the driver's.
-        poll, timer, line_timer: descriptors of the loop's epoll and of its timers.
+        poll, timer, line_timer, control: descriptors of the loop's epoll, of its timers and of the daemon's socket.
         latch: words of the latch page.
         period_ns: of the tick.
         lead_ns: how long before a tick its slack is, 0: after it.
@@ -47,8 +47,8 @@ class QuietRun:
     """
 
     def __init__(
-        self, steps: QuietSteps, poll: int, timer: int, line_timer: int, latch: NDArray[np.int64], period_ns: int,
-        lead_ns: int, daemon_lease_ns: int, idling: Idling, instants: NDArray[np.int64], pages: Pages, stops: Stops,
+        self, steps: QuietSteps, poll: int, timer: int, line_timer: int, control: int, latch: NDArray[np.int64],
+        period_ns: int, lead_ns: int, daemon_lease_ns: int, idling: Idling, instants: NDArray[np.int64], pages: Pages, stops: Stops,
         waits: Waits, clients: Attachments, statistics: TickStatistics,
     ) -> None:  # fmt: skip
         self._idling = idling
@@ -60,6 +60,7 @@ class QuietRun:
             orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
             announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
             tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, early_ns=0, heeded_ns=0,
+            brakes=0, patient=0, control=control, called=0, spare=np.zeros(MOST_EVENTS, dtype=np.int64),
             instants=instants, scheduled_ns=0, ticked_ns=0, began_ns=0, number=0, waiting=0, left=0, done=0, expired=0,
             slackens=0, ring=statistics.ring.reshape(-1), ticks=0, skipped=0, longest_ns=0,
         )  # fmt: skip
@@ -91,6 +92,7 @@ class QuietRun:
         record.ticks, record.longest_ns = statistics.ticks, statistics.longest_ns
         record.skipped = statistics.skipped
         record.waiting = record.left = record.done = record.expired = record.slackens = record.told = 0
+        record.brakes = record.patient = record.called = 0
         return True
 
     def run(self) -> None:
@@ -110,9 +112,9 @@ class QuietRun:
 
 
 def quiet_run(
-    driver: Driver, poll: int, timer: int, line_timer: int, latch: NDArray[np.int64], period_ns: int, lead_ns: int,
-    daemon_lease_ns: int, idling: Idling, pages: Pages, stops: Stops, waits: Waits, clients: Attachments,
-    statistics: TickStatistics,
+    driver: Driver, poll: int, timer: int, line_timer: int, control: int, latch: NDArray[np.int64], period_ns: int,
+    lead_ns: int, daemon_lease_ns: int, idling: Idling, pages: Pages, stops: Stops, waits: Waits,
+    clients: Attachments, statistics: TickStatistics,
 ) -> QuietRun | None:  # fmt: skip
     """Return what ticks by compiled steps, see QuietRun; None for a driver that has none, or without a library."""
     if library is None or not isinstance(driver, TickDriver) or any(block.spec.writable for block in driver.blocks):
@@ -120,6 +122,6 @@ def quiet_run(
     instants = np.zeros(2, dtype=np.int64)
     steps = driver.quiet_steps(pages, instants)
     return None if steps is None else QuietRun(
-        steps, poll, timer, line_timer, latch, period_ns, lead_ns, daemon_lease_ns, idling, instants, pages, stops,
-        waits, clients, statistics,
+        steps, poll, timer, line_timer, control, latch, period_ns, lead_ns, daemon_lease_ns, idling, instants, pages,
+        stops, waits, clients, statistics,
     )  # fmt: skip

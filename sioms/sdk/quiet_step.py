@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Final
 
 from sioms.native.language import Call, Context, Integers, Record, step
-from sioms.native.system import clock_ns, expirations, fence, record_at, set_timer, wait_for, wake
+from sioms.native.system import MOST_EVENTS, clock_ns, expirations, fence, record_at, set_timer, wait_for, wake
 
 STOPPED: Final = 0
 RESETS: Final = 1
@@ -69,8 +69,12 @@ class Quiet(Record):
     its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
     else it is idle when it has been at rest for ``rest_ns`` since ``restless_ns``, and ``told`` is RESTED or STIRS.
 
-    ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: a stop in the latch
-    has been begun by steps, and the loop has yet to see to it; what was asked for before this instant has been heeded.
+    ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: the loop has yet to
+    see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: it is a stop
+    that steps have begun. ``patient``: the device waits for its turn in a process of several, and ticks on meanwhile.
+
+    ``control``: descriptor of the daemon's socket. ``called``: it is among those that are ready. ``spare``: as many
+    numbers as ``ready``.
 
     ``scheduled_ns``, ``began_ns`` and ``number`` of the last tick, ``ticked_ns`` also of an early one. Since the loop
     has waited: ``done`` ticks; ``waiting``, how many descriptors are ``ready`` for the loop, ``left``: a timer is one
@@ -104,6 +108,11 @@ class Quiet(Record):
     stop: Call
     early_ns: int
     heeded_ns: int
+    brakes: int
+    patient: int
+    control: int
+    called: int
+    spare: Integers
     instants: Integers
     scheduled_ns: int
     ticked_ns: int
@@ -169,6 +178,14 @@ def record(q: Quiet, ended_ns: int, slack_ns: int) -> int:
 
 
 @step
+def owe(q: Quiet) -> int:
+    """Note that the loop has yet to see to what is asked for now."""
+    if not q.heeded_ns:
+        q.heeded_ns = q.began_ns
+    return 0
+
+
+@step
 def begin_stop(q: Quiet, now_ns: int) -> int:
     """Begin to stop as the latch wants it, with a tick soon. Returns 1, and nothing is done, where the loop has to."""
     if not q.latch[STOPPED] or q.latch[STOPPED] == q.stopped or q.latch[RESETS] != q.resets:
@@ -176,7 +193,8 @@ def begin_stop(q: Quiet, now_ns: int) -> int:
     if q.stop(q.device, now_ns, 0, 0):
         return 1
     q.stopped = q.latch[STOPPED]
-    q.heeded_ns = q.began_ns
+    q.brakes = 1
+    owe(q)
     if q.lead_ns and q.periods == 1 and not q.announced:
         early_ns = max(now_ns, q.ticked_ns + int(q.period_ns / 4))
         if early_ns <= q.scheduled_ns + int(q.period_ns / 2):
@@ -186,15 +204,37 @@ def begin_stop(q: Quiet, now_ns: int) -> int:
 
 
 @step
+def is_called(q: Quiet) -> int:
+    """Return whether the daemon's last order may be for this device: its message comes before the order is counted."""
+    orders = q.latch[ORDERS]
+    fence()
+    count = wait_for(q.poll, q.spare, 0)
+    if count == MOST_EVENTS:
+        return 1
+    for i in range(count):
+        if q.spare[i] == q.control:
+            return 1
+    q.orders = orders
+    return 0
+
+
+@step
 def may_tick(q: Quiet, now_ns: int) -> int:
     """Return whether there is nothing that the loop has to see to before a tick.
 
-    A stop is begun; orders that come behind it have time.
+    A stop is begun; orders that come behind it have time. Who waits for its turn ticks on before an order, and before a
+    reset as one who is stopped; one who has missed a stop and its reset does not.
     """
-    if q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns):
+    if q.latch[RESETS] != q.resets:
+        if not q.patient or not q.stopped:
+            return 0
+        owe(q)
+    elif q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns):
         return 0
-    if q.latch[RESETS] != q.resets or (q.latch[ORDERS] != q.orders and not q.heeded_ns):
-        return 0
+    if q.latch[ORDERS] != q.orders and not q.heeded_ns and is_called(q):
+        if not q.patient:
+            return 0
+        owe(q)
     return now_ns - q.latch[DAEMON_ALIVE] <= q.daemon_lease_ns and now_ns < q.until_ns
 
 
@@ -294,6 +334,8 @@ def heed(q: Quiet, count: int) -> int:
         found = LEFT if heard else heed_timer(q, q.ready[i])
         if found == LEFT and not heard and (q.ready[i] == q.timer or q.ready[i] == q.line_timer):
             q.left = 1
+        if q.ready[i] == q.control:
+            q.called = 1
         if found == LEFT:
             q.ready[left] = q.ready[i]
             left += 1
@@ -310,6 +352,28 @@ def run(q: Quiet) -> int:
         count = wait_for(q.poll, q.ready, -1)
         if not count or heed(q, count):  # none are after a signal
             return q.waiting
+
+
+@step
+def wait_turn(q: Quiet) -> int:
+    """Have a device tick on until its turn comes, also with a tick that was left; return whether the loop has to."""
+    q.patient = 1
+    if not q.left:
+        return q.slackens
+    if q.expired:
+        found = announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
+    else:
+        found = one_tick(q) if q.announced else early_tick(q)
+    if found == LEFT:
+        return 1
+    q.left = 0
+    others = 0
+    for i in range(q.waiting):
+        if q.ready[i] != q.timer and q.ready[i] != q.line_timer:
+            q.ready[others] = q.ready[i]
+            others += 1
+    q.waiting = others
+    return q.slackens
 
 
 class Many(Record):

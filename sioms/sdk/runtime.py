@@ -269,9 +269,9 @@ class Runtime:
         if self._stops_workcell or self.pages.watch or not self.sees_requests:
             return None
         return quiet_run(
-            self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._latch_words, self.period_ns,
-            self._lead_ns, self._daemon_lease_ns, self._idling, self.pages, self.stops, self.waits, self.clients,
-            self.statistics,
+            self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._control.fileno(),
+            self._latch_words, self.period_ns, self._lead_ns, self._daemon_lease_ns, self._idling, self.pages, self.stops,
+            self.waits, self.clients, self.statistics,
         )  # fmt: skip
 
     def _watch_requests(self) -> None:
@@ -377,7 +377,7 @@ class Runtime:
         self._announced, self._slack_ns = quiet.announced, quiet.worked_ns
         due_ns = quiet.scheduled_ns + quiet.announced * self.period_ns if quiet.announced else quiet.early_ns
         self._line_due_ns = due_ns or None
-        self._brakes = quiet.heeded_ns > 0
+        self._brakes = quiet.brakes > 0
         if not quiet.done:
             return
         self.tick, self.looked_ns = quiet.number, quiet.heeded_ns or quiet.began_ns

@@ -16,7 +16,7 @@ class Runtime:
     def __init__(self, fails_in=""):
         self.poll_fd, self._fails_in = os.eventfd(1, os.EFD_NONBLOCK), fails_in
         self.running, self.pause_s, self.did = True, None, []
-        self.record, self.timers = SimpleNamespace(address=0, left=0, slackens=0), ()
+        self.record, self.timers = SimpleNamespace(address=0, left=0, stopped=0, called=0), ()
 
     def _do(self, what):
         self.did.append(what)
@@ -55,6 +55,7 @@ class Runtime:
 def group(monkeypatch):
     monkeypatch.setattr(Group, "_settle", lambda self, member: None)
     monkeypatch.setattr("sioms.sdk.group.begin_stop", lambda record, now_ns: 1)
+    monkeypatch.setattr("sioms.sdk.group.wait_turn", lambda record: record.left)
     ours, theirs = socket.socketpair()
     with ours, theirs:
         yield Group(ours)
@@ -74,7 +75,7 @@ def test_what_a_device_raises_ends_it_alone(group, where):
         if member.runtime.running:
             group._serve(member.runtime.poll_fd, member)
     group._heed_requests()
-    while group._due:
+    while group._due or group._urgent:
         group._serve_next()
     assert bad.runtime.did[-2:] == [f"stopped: {where}", "released"], "stopped first, and once"
     assert bad.runtime.did.count("released") == 1 and not bad.runtime.running
@@ -105,4 +106,30 @@ def test_what_has_more_to_do_is_served_without_an_event(group):
     (member,) = start(group, "")
     os.eventfd_read(member.runtime.poll_fd)
     member.runtime.pause_s = 0.0
+    group._serve(member.runtime.poll_fd, member)
     assert group._wait() == [member.runtime.poll_fd]
+
+
+@pytest.mark.parametrize("why", ["left", "called"])
+def test_whose_tick_is_the_loops_and_whom_the_daemon_calls_go_first(group, why):
+    members = start(group, *[""] * 8)
+    fds = [member.runtime.poll_fd for member in members]
+    for fd in fds:
+        group._put(fd)
+    for member in members[4:]:
+        setattr(member.runtime.record, why, 1)
+        group._put(member.runtime.poll_fd)
+    served = []
+    for member in members:
+        member.runtime.serve = lambda ready, fd=member.runtime.poll_fd: served.append(fd)
+    for _ in members:
+        group._serve_next()
+    assert served == [*fds[4:7], fds[0], fds[7], *fds[1:4]], "but one turn in four is of those that can wait"
+
+
+def test_who_is_stopped_already_does_not_go_first_when_somebody_stops(group):
+    first, stopped, moving = start(group, "", "", "")
+    stopped.runtime.record.stopped = 5
+    group._heed_requests()
+    assert list(group._urgent) == [moving.runtime.poll_fd] and list(group._due) == [stopped.runtime.poll_fd]
+    assert first.runtime.did[-3:-1] == ["heed requests", "serve"]

@@ -35,6 +35,7 @@ from sioms.sdk.quiet_step import (
     publish,
     run,
     run_many,
+    wait_turn,
 )
 from sioms.sdk.rt import TimerFd
 
@@ -54,10 +55,10 @@ class Device:
 
     def __init__(self, lead_ns=0, **fields):
         self.ticks, self.slacks, self.answer, self.slackens, self.rests, self.stops = [], 0, 0, 0, 0, 1
-        self.timer, self.other = os.eventfd(0, os.EFD_NONBLOCK), os.eventfd(0, os.EFD_NONBLOCK)
+        self.timer, self.other, self.control = (os.eventfd(0, os.EFD_NONBLOCK) for _ in range(3))
         self.line = TimerFd()
         self.poll = select.epoll()
-        for fd in (self.timer, self.other, self.line.fd):
+        for fd in (self.timer, self.other, self.control, self.line.fd):
             self.poll.register(fd, select.EPOLLIN)
         self.latch = np.zeros(8, dtype=np.int64)
         self.latch[DAEMON_ALIVE] = time.monotonic_ns()
@@ -68,7 +69,8 @@ class Device:
             "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns, "announced": 0,
             "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
             "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
-            "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0,
+            "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0, "patient": 0, "called": 0,
+            "control": self.control, "spare": np.zeros(64, dtype=np.int64),
             "done": 0, "expired": 1, "slackens": 0, "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
         }  # fmt: skip
         for name, function in (
@@ -95,7 +97,7 @@ class Device:
         return self.stops
 
     def close(self):
-        for fd in (self.timer, self.other):
+        for fd in (self.timer, self.other, self.control):
             os.close(fd)
         self.line.close()
         self.poll.close()
@@ -118,6 +120,7 @@ def make():
 def test_what_is_said_in_the_latch_is_the_loops(make, word):
     device = make()
     device.latch[word] += 1
+    os.eventfd_write(device.control, 1)
     assert one_tick(device.quiet) == LEFT
     assert not device.ticks and device.quiet.expired == 1 and device.quiet.number == 7, "the tick is the loop's, too"
 
@@ -202,6 +205,7 @@ def test_a_missed_tick_makes_both_timers_ready_and_is_made_up_for(make):
 def test_a_stop_is_begun_by_steps_and_told_to_the_loop(make):
     device = make(began_ns=77)
     device.latch[STOPPED], device.latch[ORDERS] = 5, 1
+    os.eventfd_write(device.control, 1)
     assert one_tick(device.quiet) == LEFT and not device.ticks, "the device has refused"
     device.stops = 0
     assert one_tick(device.quiet) == HEARD and len(device.ticks) == 1
@@ -211,6 +215,51 @@ def test_a_stop_is_begun_by_steps_and_told_to_the_loop(make):
     device.quiet.expired = 1
     device.latch[STOPPED], device.latch[RESETS] = 0, 1
     assert one_tick(device.quiet) == LEFT, "but not behind a reset"
+
+
+def test_an_order_to_another_device_is_not_looked_at_by_the_loop(make):
+    device = make()
+    device.latch[ORDERS] = 3
+    os.eventfd_write(device.other, 1)
+    assert one_tick(device.quiet) == DONE
+    assert (len(device.ticks), device.quiet.orders, device.quiet.heeded_ns) == (1, 3, 0)
+
+
+@pytest.mark.parametrize("what", ["an order", "a reset of who is stopped"])
+def test_who_waits_for_its_turn_ticks_on_and_shows_what_it_had_heeded(make, what):
+    device = make(began_ns=77, stopped=5 * (what != "an order"))
+    if what == "an order":
+        device.latch[ORDERS] = 1
+        os.eventfd_write(device.control, 1)
+    else:
+        device.latch[RESETS] = 1
+    os.eventfd_write(device.timer, 1)
+    assert run(device.quiet) >= 1 and device.quiet.left and not device.ticks
+    assert wait_turn(device.quiet) == 0 and len(device.ticks) == 1
+    assert (device.quiet.heeded_ns, device.quiet.brakes, device.quiet.expired, device.quiet.left) == (77, 0, 0, 0)
+    assert device.quiet.called == (what == "an order")
+    assert device.timer not in device.ready[: device.quiet.waiting], "that tick is done"
+    os.eventfd_write(device.timer, 1)
+    run(device.quiet)
+    assert len(device.ticks) == 2 and device.quiet.heeded_ns == 77
+
+
+def test_whose_tick_is_the_loops_does_not_tick_while_it_waits(make):
+    device = make(patient=1)
+    device.latch[RESETS] = 1
+    os.eventfd_write(device.timer, 1)
+    assert run(device.quiet) == 1 and device.quiet.left, "it has missed a stop"
+    assert wait_turn(device.quiet) == 1 and not device.ticks
+    refused = make()
+    refused.answer = 1
+    os.eventfd_write(refused.timer, 1)
+    assert run(refused.quiet) == 1 and wait_turn(refused.quiet) == 1
+    assert refused.quiet.expired == 1 and refused.quiet.left and refused.quiet.waiting == 1
+    slackens = make()
+    slackens.slackens = 1
+    os.eventfd_write(slackens.timer, 1)
+    assert run(slackens.quiet) == 0 and slackens.quiet.slackens
+    assert wait_turn(slackens.quiet) == 1
 
 
 def test_a_stop_has_a_tick_soon_but_not_sooner_than_a_quarter_of_a_period(make):
@@ -320,7 +369,7 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
     )  # fmt: skip
     statistics = SimpleNamespace(ring=record.ring.reshape(7, RING), ticks=0, longest_ns=0, skipped=0)
     quiet = QuietRun(
-        steps, record.poll.fileno(), record.timer, record.line.fd, record.latch, PERIOD_NS, 0, LEASE_NS,
+        steps, record.poll.fileno(), record.timer, record.line.fd, record.control, record.latch, PERIOD_NS, 0, LEASE_NS,
         SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
         SimpleNamespace(lend=lambda: lends), SimpleNamespace(seen=(3, 2, 1)),
         SimpleNamespace(until_ns=lambda: waits_ns), SimpleNamespace(until_ns=lambda: clients_ns), statistics,
