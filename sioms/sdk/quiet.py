@@ -48,8 +48,8 @@ class QuietRun:
 
     def __init__(
         self, steps: QuietSteps, poll: int, timer: int, line_timer: int, control: int, latch: NDArray[np.int64],
-        period_ns: int, lead_ns: int, daemon_lease_ns: int, idling: Idling, instants: NDArray[np.int64], pages: Pages, stops: Stops,
-        waits: Waits, clients: Attachments, statistics: TickStatistics,
+        period_ns: int, lead_ns: int, daemon_lease_ns: int, idling: Idling, instants: NDArray[np.int64],
+        pages: Pages, stops: Stops, waits: Waits, clients: Attachments, statistics: TickStatistics,
     ) -> None:  # fmt: skip
         self._idling = idling
         self._steps, self._pages, self._stops, self._waits = steps, pages, stops, waits

@@ -270,8 +270,8 @@ class Runtime:
             return None
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._control.fileno(),
-            self._latch_words, self.period_ns, self._lead_ns, self._daemon_lease_ns, self._idling, self.pages, self.stops,
-            self.waits, self.clients, self.statistics,
+            self._latch_words, self.period_ns, self._lead_ns, self._daemon_lease_ns, self._idling, self.pages,
+            self.stops, self.waits, self.clients, self.statistics,
         )  # fmt: skip
 
     def _watch_requests(self) -> None:
