@@ -42,7 +42,9 @@ PAUSE_S = 50e-6
 must not work for long without a pause."""
 IN_A_ROW = 8
 FAIR = 4
-"""One turn in so many is of those that can wait, however many cannot."""
+"""One turn in so many goes to who can wait best, however many cannot."""
+STOPS, STANDS, CALLED, CAN_WAIT = range(4)
+"""Who is served first: who has yet to begin a stop; whose tick is the loop's; whom the daemon calls; the others."""
 
 
 @dataclass(slots=True)
@@ -80,10 +82,8 @@ class Group:
         self._epoll.register(sock.fileno(), select.EPOLLIN)
         self._members: dict[int, Member] = {}
         self._built: deque[Member] = deque()
-        self._due: dict[int, None] = {}
-        """Who has more to do than to tick, by descriptor: one after another, the others tick in between."""
-        self._urgent: dict[int, None] = {}
-        """Who goes before them: whose tick is the loop's, who has yet to begin a stop, whom the daemon calls."""
+        self._due: tuple[dict[int, None], ...] = ({}, {}, {}, {})
+        """Who has more to do than to tick, by rank and descriptor: one after another, the others tick in between."""
         self._pauses: dict[int, float] = {}
         """After how long members have to be served without an event."""
         self._turns = 0
@@ -112,8 +112,7 @@ class Group:
     def _wait(self) -> list[int]:
         """Return the descriptors that are ready; those of members who have more to do are."""
         pauses = self._pauses
-        is_waited_for = self._built or self._due or self._urgent
-        timeout_s = 0.0 if is_waited_for else min(pauses.values(), default=None)
+        timeout_s = 0.0 if self._built or any(self._due) else min(pauses.values(), default=None)
         if library is None:
             found = [fd for fd, _ in self._epoll.poll(timeout_s)]
         else:
@@ -124,25 +123,29 @@ class Group:
     def _put(self, fd: int) -> None:
         """Have a member served soon; until then it ticks on, unless the tick itself is what there is to be served."""
         quiet = self._members[fd].quiet
-        if quiet is not None and not wait_turn(quiet.record):
-            if not quiet.record.called:
-                if fd not in self._urgent:
-                    self._due.setdefault(fd)
-                return
-        else:
+        if quiet is None or wait_turn(quiet.record):
             self._of[fd] = 0
-        self._due.pop(fd, None)
-        self._urgent.setdefault(fd)
+            self._rank(fd, STANDS)
+        else:
+            self._rank(fd, CALLED if quiet.record.called else CAN_WAIT)
+
+    def _rank(self, fd: int, rank: int) -> None:
+        """Let a member wait with others of its rank, behind those that have come before, if not with better ones."""
+        if any(fd in better for better in self._due[:rank]):
+            return
+        for worse in self._due[rank + 1 :]:
+            worse.pop(fd, None)
+        self._due[rank].setdefault(fd)
 
     def _serve_next(self) -> None:
         """Serve the member whose turn it is."""
-        if not self._due and not self._urgent:
+        if not any(self._due):
             return
         self._turns += 1
-        can_wait = not self._urgent or (self._due and self._turns % FAIR == 0)
-        whose = self._due if can_wait else self._urgent
-        fd = next(iter(whose))
-        del whose[fd]
+        order = self._due if self._turns % FAIR else self._due[::-1]
+        waiting = next(each for each in order if each)
+        fd = next(iter(waiting))
+        del waiting[fd]
         self._serve(fd, self._members[fd])
         if self._turns % IN_A_ROW == 0:
             time.sleep(PAUSE_S)
@@ -228,7 +231,8 @@ class Group:
         self._guarded(member, lambda: self._lend(fd, member))
         if not member.runtime.running:
             del self._members[fd]
-            for waiting in (self._due, self._urgent, self._pauses):
+            self._pauses.pop(fd, None)
+            for waiting in self._due:
                 waiting.pop(fd, None)
             self._epoll.unregister(fd)
             member.runtime.release()
@@ -263,11 +267,7 @@ class Group:
         now_ns = time.monotonic_ns()
         owing = {fd: self._is_stopped(member, now_ns) for fd, member in self._members.items() if member.owes}
         for fd, is_stopped in owing.items():
-            if not is_stopped:
-                self._due.pop(fd, None)
-            elif fd not in self._urgent:
-                self._due.setdefault(fd)
-        self._urgent = dict.fromkeys([*(fd for fd, is_stopped in owing.items() if not is_stopped), *self._urgent])
+            self._rank(fd, CAN_WAIT if is_stopped else STOPS)
 
     def _is_stopped(self, member: Member, now_ns: int) -> bool:
         """Have a member begin its stop by steps; return whether it has, or has been stopped before."""

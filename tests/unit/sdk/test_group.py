@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from sioms.sdk.group import Group, Member
+from sioms.sdk.group import CALLED, CAN_WAIT, STANDS, STOPS, Group, Member
 
 
 class Runtime:
@@ -75,7 +75,7 @@ def test_what_a_device_raises_ends_it_alone(group, where):
         if member.runtime.running:
             group._serve(member.runtime.poll_fd, member)
     group._heed_requests()
-    while group._due or group._urgent:
+    while any(group._due):
         group._serve_next()
     assert bad.runtime.did[-2:] == [f"stopped: {where}", "released"], "stopped first, and once"
     assert bad.runtime.did.count("released") == 1 and not bad.runtime.running
@@ -110,26 +110,40 @@ def test_what_has_more_to_do_is_served_without_an_event(group):
     assert group._wait() == [member.runtime.poll_fd]
 
 
-@pytest.mark.parametrize("why", ["left", "called"])
-def test_whose_tick_is_the_loops_and_whom_the_daemon_calls_go_first(group, why):
-    members = start(group, *[""] * 8)
-    fds = [member.runtime.poll_fd for member in members]
-    for fd in fds:
-        group._put(fd)
-    for member in members[4:]:
-        setattr(member.runtime.record, why, 1)
+def put(group, members, **record):
+    for member in members:
+        vars(member.runtime.record).update(record)
         group._put(member.runtime.poll_fd)
+
+
+def test_whose_tick_is_the_loops_and_whom_the_daemon_calls_go_first(group):
+    members = start(group, *[""] * 9)
+    patient, called, standing = members[:3], members[3:6], members[6:]
+    put(group, members)
+    put(group, called, called=1)
+    put(group, standing, left=1, called=1)
+    put(group, standing, left=0)
+    assert [[*waiting] for waiting in group._due] == [
+        [], *([member.runtime.poll_fd for member in each] for each in (standing, called, patient)),
+    ]  # fmt: skip
     served = []
     for member in members:
-        member.runtime.serve = lambda ready, fd=member.runtime.poll_fd: served.append(fd)
+        member.runtime.serve = lambda ready, member=member: served.append(member)
     for _ in members:
         group._serve_next()
-    assert served == [*fds[4:7], fds[0], fds[7], *fds[1:4]], "but one turn in four is of those that can wait"
+    expected = [*standing, patient[0], *called, *patient[1:]]
+    assert [members.index(member) for member in served] == [members.index(member) for member in expected], (
+        "but one turn in four goes to those that can wait"
+    )
 
 
 def test_who_is_stopped_already_does_not_go_first_when_somebody_stops(group):
-    first, stopped, moving = start(group, "", "", "")
+    first, stopped, moving, standing = start(group, "", "", "", "")
     stopped.runtime.record.stopped = 5
+    put(group, [standing], left=1, stopped=5)
     group._heed_requests()
-    assert list(group._urgent) == [moving.runtime.poll_fd] and list(group._due) == [stopped.runtime.poll_fd]
+    found = [group._due[rank] for rank in (STOPS, STANDS, CALLED, CAN_WAIT)]
+    assert [[*each] for each in found] == [
+        [moving.runtime.poll_fd], [standing.runtime.poll_fd], [], [stopped.runtime.poll_fd],
+    ]  # fmt: skip
     assert first.runtime.did[-3:-1] == ["heed requests", "serve"]
