@@ -51,6 +51,27 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
     assert quiet.driver.blocks[2].edges[0] > 10, "beams were broken, and free again"
 
 
+@pytest.mark.parametrize("late", [False, True])
+def test_a_device_that_is_late_plans_ahead_and_goes_on_by_steps(monkeypatch, late):
+    """Else its late tick is the loop's, and all after it, each later than the one before."""
+    now_ns = 1_000_000_000
+    clock_ns = now_ns + 20 * PERIOD_NS
+    monkeypatch.setattr("time.monotonic_ns", lambda: clock_ns)
+    cell = Cell(True)
+    cell.tick(now_ns)
+    records = np.zeros(2, numpy_dtype(NodeClass.AXIS))
+    records["control_mode"], records["velocity"] = int(ControlMode.VELOCITY | ControlMode.SPECIFIED_TIME), 0.1
+    records["time"] = 0.3
+    cell.driver.bank.append(records, range(3), now_ns)
+    for _ in range(2):
+        now_ns += PERIOD_NS
+        cell.driver.tick(now_ns)
+        cell.driver.slack(now_ns, now_ns + PERIOD_NS)
+    if not late:
+        clock_ns = now_ns + PERIOD_NS // 2
+    assert cell.steps.is_ready(True) == late
+
+
 @pytest.mark.parametrize("at_ms", [300, 570], ids=["as steps", "from an edge on in Python"])
 def test_turns_that_steps_make_up_for_are_shown_each_at_its_time(monkeypatch, at_ms):
     monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))
