@@ -25,6 +25,8 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import Options, Prepared, noise_read, prepare, reread, searched
 from sioms.reconcile.records import Session
+from sioms.reconcile.refine import ahead, loops, nearest
+from sioms.reconcile.refine import settled as settled_numbers
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.search import Found, Searcher, Step
 from sioms.reconcile.thresholds import (
@@ -78,7 +80,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
             break
         o.progress(f"{force.text}: searching anew beside it")
         s = _explained(s.ready.beside(force), o)
-    s = _plain(_upright(s))
+    s = _foreseen(_plain(_upright(s)), o)
     burst = bursts(s.ready.problem, s.found.fit)
     o.progress("identifiability: look-alikes in the place of each effect")
     found, others = settle(s.searcher, s.found, s.excited.pairs)
@@ -87,7 +89,28 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         burst = bursts(s.ready.problem, found.fit)
     verdict = conclude(s, o, others, burst)
     # a log whose rows the controller has not made one by one is of an axis that has it nevertheless
-    return replace(verdict, model=replace(verdict.model, controller=nominal.controller))
+    model = replace(verdict.model, controller=nominal.controller, refine=nominal.refine, within={})
+    return replace(verdict, model=model)
+
+
+def _foreseen(s: Searched, o: Options) -> Searched:
+    """Go back to where a model that runs free came nearer, and settle the refined numbers there."""
+    found, searcher, problem, nominal = s.found, s.searcher, s.ready.problem, s.ready.nominal
+    if rattles(found.fit.model) or (loops(problem, nominal) and not nominal.refine):
+        return s
+    o.progress("what the model predicts by itself")
+    fit = settled_numbers(problem, nominal, found.fit, searcher.frozen)
+    earlier = [step.model for step in found.ladder if not rattles(step.model)]
+    if not loops(problem, nominal) and (plain := nearest(problem, fit.model, earlier)) is not None:
+        back = settled_numbers(problem, nominal, refit(problem, plain, searcher.frozen), searcher.frozen)
+        fit = back if ahead(problem, back.model) < ahead(problem, fit.model) else fit
+    if fit is found.fit:
+        return s
+    gone = [n for n in found.fit.model.effects if n not in fit.model.effects]
+    what = ("leave", " and ".join(gone)) if gone else ("refine", " and ".join(nominal.refine))
+    step = Step(*what, fit.ratio, 1.0 - fit.cost / found.fit.cost, fit.model)
+    found = Found(fit, searcher.loss(fit), (*found.ladder, step))
+    return replace(s, found=found, share=smoother_share(problem, fit), rejected=(*s.rejected, *gone))
 
 
 def _upright(s: Searched) -> Searched:

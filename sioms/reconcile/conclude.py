@@ -31,12 +31,14 @@ from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import TIMES, Options, Prepared
 from sioms.reconcile.rate import SAMPLE_TIME, instead, remark
 from sioms.reconcile.records import Session
+from sioms.reconcile.refine import runs_away
 from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
-from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MOSTLY, QUIET, REFUTED, UNEXPLAINED
+from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MISSED, MOSTLY, QUIET, REFUTED, UNEXPLAINED
 from sioms.reconcile.timed import as_recorded
+from sioms.reconcile.variation import named as varied
 from sioms.reconcile.verdict import Candidate, Gap, NamedEffect, Outcome, Place
 
 HELD = (
@@ -50,6 +52,7 @@ PAYLOAD = "payload"
 #: Why an effect of the model is no finding.
 REFUSED_FREE = "the model with it does not move as the machine did"
 REFUSED_BEYOND = "too much remains beside it for a part to be told"
+REFUSED_IDLE = "held-out samples are met as well without it: it may stand for a part of what remains"
 REFUSED_BOUND = "a number of it is at the end of what it can be: it stands for something else"
 
 
@@ -93,6 +96,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
     beyond = ratio > LARGE
+    if runs_away(found.fit.model):
+        judged = replace(judged, refusals=(*judged.refusals, _of_inertia(nominal, found.fit.model)))
     missing = bool(terms) or bool(leaning) or disturbance or beyond or odd or bool(judged.refusals)
     blindly = ready.blind and any(e.name == PAYLOAD for e in named)
     said = outcome(bool(named), missing, bool(open_rivals) or blindly)
@@ -108,6 +113,11 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     if ready.blind:
         notes.insert(0, remark(nominal))
     tried = refused(named, leaning, bool(judged.refusals), beyond)
+    if judged.refusals:
+        tried += tuple(Candidate(e.name, e.title, REFUSED_FREE) for e in terms if e.name in fit.model.effects)
+    elif said is Outcome.UNEXPLAINED and not rattles(fit.model):
+        tried += _idle(s, (*named, *terms), tried)
+    terms = [e for e in terms if e.name not in {c.name for c in tried}]
     found_here = [e for e in named if e.name not in {c.name for c in tried}]
     others_said = _alternatives(fit.model, found_here, open_rivals, blindly) if said is Outcome.AMBIGUOUS else ()
     if blindly:
@@ -117,7 +127,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     return AxisVerdict(
         outcome=said,
         nominal=nominal,
-        model=fit.model,
+        model=as_stated(fit.model, nominal) if judged.refusals else fit.model,
         effects=tuple(found_here),
         candidates=tried,
         alternatives=others_said,
@@ -153,6 +163,38 @@ def refused(
     if beyond:
         return tuple(Candidate(e.name, e.title, REFUSED_BEYOND) for e in named)
     return tuple(Candidate(e.name, e.title, REFUSED_BOUND) for e in leaning)
+
+
+def _idle(s: Searched, every: Sequence[NamedEffect], tried: Sequence[Candidate]) -> tuple[Candidate, ...]:
+    """Return what the untouched samples do not need: beside a remainder it may have taken a part of that."""
+    model, frozen = s.found.fit.model, s.searcher.frozen
+    kept = {*frozen, *(c.name for c in tried)}
+    looked = [e for e in every if e.name in model.effects and e.name not in kept]
+    both = s.ready.problem, s.ready.final
+    return tuple(Candidate(e.name, e.title, REFUSED_IDLE) for e in looked if not needed(both, model, e.name, frozen))
+
+
+def needed(problems: tuple[Problem, Problem], model: AxisModel, name: str, frozen: Sequence[str] = ()) -> bool:
+    """Say whether untouched samples are met worse without an effect.
+
+    Args:
+        problems: the samples that were searched, to which what is left is fitted again, and the untouched ones.
+    """
+    bare = refit(problems[0], varied(model.without_effect(name)), frozen, 4).model
+    left, more = (float(np.sum(problems[1].residual(m) ** 2)) for m in (model, bare))
+    return more > (1.0 + MISSED) * left
+
+
+def as_stated(model: AxisModel, nominal: AxisModel) -> AxisModel:
+    """Give the numbers back that were refined: those of a refused model are no findings either."""
+    return replace(model, **{symbol: getattr(nominal, symbol) for symbol in nominal.refine})
+
+
+def _of_inertia(nominal: AxisModel, model: AxisModel) -> str:
+    return (
+        f"the inertia, refined, comes to {model.inertia / nominal.inertia:.3g} times the stated one, the end of what "
+        "is tried: with it the model hardly listens to its force, and stands for something else"
+    )
 
 
 def _alternatives(

@@ -186,7 +186,7 @@ def free_parameters(model: AxisModel, frozen: Sequence[str] = ()) -> tuple[Free,
     for symbol in model.refine:
         value = getattr(model, symbol)
         least = 0.01 * value if symbol == "inertia" else 0.0  # without inertia there is no motion to predict
-        out.append(Free(BASE, symbol, max(abs(value), 1e-12), least, np.inf))
+        out.append(Free(BASE, symbol, max(abs(value), 1e-12), *model.within.get(symbol, (least, np.inf))))
     return tuple(out)
 
 

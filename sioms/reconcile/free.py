@@ -105,6 +105,15 @@ def freely(
     return tuple(_over(problems, models, noise, rng, horizon) for horizon in every.values())
 
 
+def errors(problem: Problem, model: AxisModel, horizon_s: float) -> Array:
+    """Return how far a model that runs free over segments of a length is from the measurement, shape (n,), [{x}]; none
+    where no record holds one.
+    """
+    packed = pack(model)
+    off = [flight(model, packed, s).error for s in _segments(problem, model, horizon_s)]
+    return np.concatenate(off) if off else np.empty(0)
+
+
 def _over(
     problems: tuple[Problem, Problem],
     models: tuple[AxisModel, AxisModel],
@@ -148,7 +157,7 @@ def _segments(problem: Problem, model: AxisModel, horizon: float) -> Iterator[Se
         for record, run in zip(problem.session.records, problem.runs(model), strict=True)
         for a, b in _cuts(problem, record, horizon, model.sample_time_s)
     ]
-    chosen = np.unique(np.linspace(0, len(every) - 1, min(len(every), MOST_SEGMENTS)).astype(int))
+    chosen = np.unique(np.linspace(0, len(every) - 1, min(len(every), MOST_SEGMENTS)).astype(int)) if every else ()
     return (every[i] for i in chosen)
 
 

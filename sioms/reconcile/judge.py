@@ -17,7 +17,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.free import Freely
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.thresholds import FREE_FLOORS, FREE_LEAST, FREE_NEAR, FREE_SHARE, GIVEN_POWER, STUCK
+from sioms.reconcile.thresholds import FREE_FLOORS, FREE_LEAST, FREE_NEAR, FREE_SHARE, GIVEN_POWER, STUCK, WORSE
 from sioms.reconcile.verdict import Gap
 
 FORCE_LOOP = "force, closed loop"
@@ -46,7 +46,7 @@ def judge(problem: Problem, model: AxisModel, free: Sequence[Freely], gaps: Sequ
     """
     loop = next((g for g in gaps if g.channel == FORCE_LOOP), None)
     force = problem.join([r.force for r in problem.session.records])
-    refusals = _impossible(problem, model, free)
+    refusals = [*_impossible(problem, model, free), *_worse(free, loop)]
     if loop is not None:
         above = [Above("in closed loop", "force", loop.after, loop.floor, float(np.std(force)))]
     else:
@@ -99,6 +99,18 @@ def _nowhere_near(free: Sequence[Freely], above: Sequence[Above], noisy: bool) -
         f"{least.where}, the corrected model is off by {100 * least.share:.0f} % of the motion: short windows hide "
         "what it lacks"
     ]
+
+
+def _worse(free: Sequence[Freely], loop: Gap | None) -> list[str]:
+    """Say that the model was better as it was: over some length, what is corrected predicts worse."""
+    runs = [(f"running free {f.over}", f.before, f.after, f.floor) for f in free]
+    if loop is not None:
+        runs = [("in closed loop", loop.before, loop.after, loop.floor)]
+    worse = [(where, after / before) for where, before, after, floor in runs if after > WORSE * max(before, floor)]
+    if not worse:
+        return []
+    where, times = max(worse, key=lambda w: w[1])
+    return [f"{where}, the corrected model is off by {times:.2g} times as much as the nominal one: it is no correction"]
 
 
 def _impossible(problem: Problem, model: AxisModel, free: Sequence[Freely]) -> list[str]:

@@ -51,6 +51,7 @@ class AxisModel:
         effects: values per parameter symbol per effect name; only what is switched on.
         refine: base parameters ("inertia", "viscous") that are uncertain and fitted along, not named.
         driven: False where the axis has no drive: it swings or coasts freely, or only ``external`` moves it.
+        within: bounds of numbers in ``refine`` while effects are searched; one without is only kept from zero.
     """
 
     rotary: bool
@@ -67,6 +68,7 @@ class AxisModel:
     refine: tuple[str, ...] = ()
     name: str = "axis"
     driven: bool = True
+    within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
     def position_unit(self) -> str:

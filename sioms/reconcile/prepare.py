@@ -19,6 +19,7 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.rate import trusted_blindly
 from sioms.reconcile.records import Session
+from sioms.reconcile.refine import bounded
 from sioms.reconcile.sampling import Sampling, read_as, sampling_of, trusted
 from sioms.reconcile.scale import check_scale
 from sioms.reconcile.timed import Timed, as_recorded, known_beside
@@ -147,7 +148,7 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
     o.progress("channels: sensor, then drive")
     seen = searched(session)
     findings: list[Finding] = []
-    model = nominal
+    model = bounded(nominal)
     coarse = lattice(seen, nominal)
     scale = index_scale(seen, nominal)
     findings += [f for f in (coarse, scale) if f is not None]

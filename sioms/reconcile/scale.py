@@ -103,12 +103,6 @@ def _left(columns: Array, of: Array) -> float:
     return float(np.sum((of[half:] - columns[half:] @ c) ** 2))
 
 
-def inertia_seen(problem: Problem, model: AxisModel) -> float | None:
-    """Return the inertia that force and motion show, as a multiple of the nominal one; None where too little tells."""
-    columns, forces = _columns(problem, model)
-    return _seen(problem.join(columns), problem.join(forces), SHOWN, FITS).inertia
-
-
 def _check_ratio(ratio: float | None, model: AxisModel) -> list[str]:
     if ratio is None:
         return []

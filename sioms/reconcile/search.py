@@ -398,6 +398,6 @@ class Searcher(Search[AxisModel]):
 def values_of(model: AxisModel) -> Hashable:
     """Return all that a search may change of a model, to look it up by."""
     return (
-        tuple(getattr(model, symbol) for symbol in model.refine),
+        (model.inertia, model.viscous, model.refine, tuple(model.within.items())),
         tuple((n, *v.items()) for n, v in model.effects.items()),
     )

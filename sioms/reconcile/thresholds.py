@@ -165,6 +165,16 @@ STUCK = 0.2
 all (0560)."""
 GIVEN_POWER = 0.02
 """What depends on speed gives at most this power to the axis, of the rated force's at the largest speed (0560)."""
+WORSE = 1.1
+"""A model that runs free comes no farther from untouched samples than this multiple of what the nominal model, or the
+floor, does; and refined numbers are those of short windows within this multiple of the best. Five public records
+(0780)."""
+MISSED = 0.005
+"""Beside a remainder an effect is a finding only where untouched samples, too, lose this share by its absence. Five
+public records (0780)."""
+WITHIN, WIDER = 4.0, 0.95
+"""A refined inertia is within this multiple of the stated one while effects are searched; beyond it, beside all of
+them, where a free run then leaves less than this share. A joint of an arm: 43 without, where nothing shows (0780)."""
 FELL = 0.7
 """The noise is taken again from what a search leaves when it fell below this share, and the search repeated."""
 

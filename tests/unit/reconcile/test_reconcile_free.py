@@ -68,6 +68,16 @@ def test_a_hardening_spring_shows_in_the_free_run_alone() -> None:
     assert judged(problem, RESONATOR, HARD).refusals == ()
 
 
+def test_a_model_that_predicts_worse_than_the_nominal_one_is_refused() -> None:
+    """However little it leaves above the floor, and whatever short windows say."""
+    problem = swung(RESONATOR, noise=0.5)
+    off = RESONATOR.with_effect("payload", {"J_extra": 0.03})
+    assert any("no correction" in r for r in judged(problem, RESONATOR, off).refusals)
+    assert judged(problem, off, RESONATOR).refusals == ()
+    closed = looped(AXIS, 1e-3)
+    assert any("no correction" in r for r in judged(closed, AXIS, AXIS.with_effect("coulomb", {"Fc": 0.02})).refusals)
+
+
 @pytest.mark.parametrize(("world", "share"), [(RESONATOR, 0.34), (HARD, 0.5)])
 def test_the_floor_of_a_free_run_is_right_within_a_third(world: AxisModel, share: float) -> None:
     problem = swung(world, noise=0.5)

@@ -12,7 +12,7 @@ import pytest
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.axis_verdict import AxisVerdict
-from sioms.reconcile.conclude import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, refused
+from sioms.reconcile.conclude import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, as_stated, refused
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.model_file import parse_model, write_model
 from sioms.reconcile.prepare import Options
@@ -45,6 +45,12 @@ def test_a_refused_model_makes_candidates_of_all_its_effects(
     assert [c.name for c in found] == names
     assert {c.why for c in found} == {why}
     assert refused(named, [], False, False) == ()
+
+
+def test_a_refused_model_has_the_stated_numbers_where_they_were_refined() -> None:
+    nominal = replace(read_model(AXES / "s05" / "nominal.json"), refine=("inertia",))
+    tried = replace(nominal, inertia=3.0 * nominal.inertia, viscous=0.1)
+    assert as_stated(tried, nominal) == replace(nominal, viscous=0.1)
 
 
 @cache
