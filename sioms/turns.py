@@ -147,8 +147,24 @@ class Turns:
         else:
             for fd, _ in source.waiting.poll(0, 1):
                 source.callbacks[fd]()
+        self._use(source, time.monotonic_ns() - began_ns)
+        if self.gives_way:
+            os.sched_yield()
+
+    def charge(self, fd: int, took_ns: int) -> None:
+        """Count what has been served of a connection without its turn [ns]; one that is served no more has no count."""
+        _, source = self._of.get(fd, (None, None))
+        if source is None:
+            return
+        began_ns = time.monotonic_ns()
+        if began_ns - self._window_ns >= WINDOW_NS:
+            self._open_window(began_ns)
+        self._now_ns = max(source.used_ns, self._now_ns)
+        self._use(source, took_ns)
+
+    def _use(self, source: _Source, took_ns: int) -> None:
         # Beyond a window, others of this processor have had it meanwhile.
-        took_ns = min(time.monotonic_ns() - began_ns, WINDOW_NS)
+        took_ns = min(took_ns, WINDOW_NS)
         source.used_ns = self._now_ns + took_ns
         self._left_ns[source.kind] -= took_ns
         if self._left_ns[source.kind] <= 0:
@@ -156,8 +172,6 @@ class Turns:
                 if other.kind == source.kind and other not in self._paused:
                     self._paused.append(other)
                     self._epoll.modify(other.fd, 0)
-        if self.gives_way:
-            os.sched_yield()
 
     def _open_window(self, now_ns: int) -> None:
         self._window_ns = now_ns

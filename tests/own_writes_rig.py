@@ -24,8 +24,10 @@ import pytest
 from ownership_fakes import Timer
 
 import sioms.client.node_core
+import sioms.motion.bank
 import sioms.native.language
 import sioms.sdk.connected
+import sioms.sdk.desk
 import sioms.sdk.quiet
 from sioms.client import shown
 from sioms.client.channel import Call, Channel
@@ -40,6 +42,7 @@ from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.messages import encode
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BinaryBlock, BlockSpec, Description
+from sioms.sdk.desk import WriteDesk
 from sioms.sdk.drive_axes import AxesUnit
 from sioms.sdk.driver import Driver, Kit, LineDriver, LineUnit, StreamDriver, TickDriver
 from sioms.sdk.exchange import Exchange, Steps
@@ -100,6 +103,7 @@ class World:
     Attributes:
         between: what others do while a tick is under way: called at some of its looks at the clock.
         quiet: how many ticks were done by the quiet steps.
+        served: how many writes were served by steps, of those that are tried as often as ``by_steps`` says.
     """
 
     def __init__(
@@ -128,7 +132,8 @@ class World:
         self.runtime._scheduled_ns = time.monotonic_ns()
         self.runtime.looked_ns = time.monotonic_ns()
         self.page_fds = list(self.runtime.pages.fds)
-        self.ticks = self.quiet = 0
+        self.ticks = self.quiet = self.served = 0
+        self.by_steps = 0.5
         self.between: Callable[[], object] | None = None
         self._run = self._quiet_run()
         for _ in range(400):
@@ -183,7 +188,9 @@ class World:
         self.runtime.clients.drop(self.runtime.clients.handles[client.node.handle])
 
     def serve(self, client: Client) -> None:
-        """Let the driver serve what a client has sent."""
+        """Let the driver serve what a client has sent, half of the time by steps if they can."""
+        if self._run is not None and self.chance.random() < self.by_steps and self._serve_quietly(client):
+            return
         handle = self.runtime.clients.handles[client.node.handle]
         self.runtime.clients._readable(handle)
 
@@ -207,6 +214,19 @@ class World:
             except BlockingIOError:
                 return
 
+    def _serve_quietly(self, client: Client) -> bool:
+        """Serve a write by steps; False when it is the loop's."""
+        runtime = self.runtime
+        runtime._quiet, sock = self._run, runtime.clients.handles[client.node.handle].sock.fileno()
+        quiet = runtime.lend()
+        if quiet is None:
+            return False
+        who = self._writer_of(quiet.record.desk, sock)
+        done: bool = who >= 0 and self._serve_writer(quiet.record, who) == 0
+        runtime.take_back(quiet)
+        self.served += done
+        return done
+
     def _intrude(self) -> None:
         if self.between and self.chance.random() < 0.02:
             CLOCK.intrude = None
@@ -222,7 +242,17 @@ class World:
         steps = runtime.driver.quiet_steps(runtime.pages, instants)
         if steps is None:
             return None
-        with _in_python("sioms.sdk.quiet_step") as module:
+        with (
+            _in_python("sioms.motion.plain_step") as plain,
+            _in_python("sioms.sdk.serve_step") as serving,
+            _in_python("sioms.sdk.quiet_step") as module,
+            pytest.MonkeyPatch.context() as patch,
+        ):
+            patch.setattr(sioms.motion.bank, "plain_of", plain.plain_of)
+            patch.setattr(sioms.sdk.desk, "Desk", serving.Desk)
+            serving.clock_ns, serving.admits = CLOCK, plain.admits
+            module.serve_packet = serving.serve_packet
+            self._writer_of, self._serve_writer = serving.writer_of, module.serve_writer
             module.clock_ns, module.wait_for = CLOCK, self._wait_for
             module.expirations = lambda fd: runtime._timer.expirations() if fd == 1 else 1
             module.set_timer = lambda fd, when_ns: 0
@@ -231,6 +261,7 @@ class World:
                 steps, 0, 1, 2, CONTROL, runtime._latch_words, runtime.period_ns, runtime._lead_ns,
                 runtime._daemon_lease_ns, runtime._idling, instants, runtime.pages, runtime.stops, runtime.waits,
                 runtime.clients, runtime.statistics,
+                WriteDesk(runtime.blocks, runtime.clients, runtime.stops, runtime.pages, runtime._request_fd, False),
             )  # fmt: skip
 
     def _wait_for(self, poll: int, ready: Any, timeout_ms: int) -> int:
@@ -309,7 +340,8 @@ def _in_python(name: str) -> Iterator[ModuleType]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(sioms.native.language, "library", None)
         spec.loader.exec_module(module)
-        patch.setattr(sioms.sdk.quiet, "Quiet", module.Quiet)
+        if hasattr(module, "Quiet"):
+            patch.setattr(sioms.sdk.quiet, "Quiet", module.Quiet)
         yield module
 
 

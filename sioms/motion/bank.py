@@ -24,6 +24,7 @@ from sioms.protocol.records import READ, read_rows
 from .arrival import Arrivals
 from .commands import WIRE_DTYPE, Command
 from .plain import MOST
+from .plain_step import Plain, plain_of
 from .queue import EMERGENCY_STOP, LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .settings import AxisSettings
 from .store import NEVER_NS
@@ -131,6 +132,16 @@ class Bank(ABC):
         if len(written) > MOST:
             self._settle()
         return True
+
+    @property
+    def defers(self) -> bool:
+        """Whether ``offer`` may take what is written, and nothing that it has taken waits."""
+        return self._seen and self.DEFERS and not self._written
+
+    @property
+    def plain(self) -> Plain | None:
+        """What the short writes that ``offer`` takes are judged by, made anew for steps; None: it takes none."""
+        return plain_of(self._queue) if self.DEFERS else None
 
     def judge(self, records: NDArray[Any], axes: AxesLike, now_ns: int, *, replace: bool = False) -> Judgement:
         """Judge a long write piece by piece, between ticks; what append() would refuse is refused here.

@@ -24,6 +24,7 @@ _QUANTITIES = (
     modes.POSITION, modes.VELOCITY, modes.ACCELERATION, modes.JERK, modes.FORCE, modes.FORCE_VELOCITY,
 )  # fmt: skip
 _BESIDE = (modes.MAX_VEL_ACC, modes.MAX_FORCE, modes.FORCE_OFFSET, modes.SYNCH)
+QUANTITY, BESIDE = sum(_QUANTITIES), sum(_BESIDE)
 _PLAIN = frozenset(
     quantity | sum(flag for i, flag in enumerate(_BESIDE) if beside >> i & 1)
     for quantity in _QUANTITIES
@@ -48,7 +49,7 @@ class PlainCheck:
     """
 
     def __init__(self, offered: Sequence[int], limits: Limits) -> None:
-        self._offered = list(offered)
+        self.offered = [int(flags) for flags in offered]
         self._minimum, self._maximum = limits.minimum, limits.maximum
         self._below, self._above = limits.room_below.tolist(), limits.room_above.tolist()
         self._limits = limits
@@ -70,7 +71,7 @@ class PlainCheck:
         """Return a record of the wire as a command of a bank axis; None when it is not plain, or bad."""
         mode = record[_MODE]
         checks = self._checks.get(mode) or self._checks_of(mode)
-        if checks is None or mode & ~self._offered[axis]:
+        if checks is None or mode & ~self.offered[axis]:
             return None
         for column, bound, positive in checks:
             value = record[column]

@@ -101,7 +101,7 @@ class CommandQueue:
         self.tail = Tail(np.full((self.n, 3), np.nan), self.in_force[0].copy(), self.in_force[1].copy())
         self._limits_set = 0
         self._feasibility = Feasibility(self.limits, self._validator)
-        self._plain = PlainCheck(self._validator.offered, self.limits)
+        self.plain = PlainCheck(self._validator.offered, self.limits)
         self._waiting: dict[tuple[int, int], set[int]] = {}
         self._fault_text: dict[int, str] = {}
         self._lost_text: dict[int, str] = {}
@@ -199,7 +199,7 @@ class CommandQueue:
                 return None
             axis = int(axes[local])
             full = not replace and self._buffers.count.item(axis) > most
-            command = None if full or self.is_barred(axis) else self._plain.command(record, axis)
+            command = None if full or self.is_barred(axis) else self.plain.command(record, axis)
             if command is None:
                 return None
             commands.append(command)

@@ -33,10 +33,12 @@ import numpy as np
 MODULES: tuple[str, ...] = (
     "sioms.motion.axis_step",
     "sioms.motion.stop_step",
+    "sioms.motion.plain_step",
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
     "sioms.plant.stepper_step",
     "sioms.plant.binary_step",
+    "sioms.sdk.serve_step",
     "sioms.sdk.quiet_step",
     "sioms.drivers.sim.axes_step",
 )
@@ -69,6 +71,15 @@ class Integers:
     def __setitem__(self, i: int, value: int) -> None: ...
 
 
+class Bytes:
+    """Array of uint8; what is put into it is below 256."""
+
+    dtype, c = np.uint8, "uint8_t *"
+
+    def __getitem__(self, i: int) -> int: ...  # type: ignore[empty-body]
+    def __setitem__(self, i: int, value: int) -> None: ...
+
+
 class Flags:
     """Array of bool."""
 
@@ -78,7 +89,7 @@ class Flags:
     def __setitem__(self, i: int, value: bool) -> None: ...
 
 
-ARRAYS = (Floats, Integers, Flags)
+ARRAYS = (Floats, Integers, Flags, Bytes)
 _DTYPES: dict[Any, np.dtype[Any]] = {kind: np.dtype(kind.dtype) for kind in ARRAYS}
 
 
@@ -120,7 +131,7 @@ library = _load()
 
 
 class Record:
-    """Numbers and arrays that steps work on, declared by annotations: int, float, Floats, Integers, Flags, records.
+    """Numbers and arrays that steps work on, declared by annotations: int, float, arrays of ARRAYS, records.
 
     Args:
         fields: a value for each; arrays are used where they are, not copied, and must stay where they are.

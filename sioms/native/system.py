@@ -1,13 +1,15 @@
-"""What steps may ask the system for: time, events, memory in order. Each is here in Python and, in ``C``, in C."""
+"""What steps may ask the system for: time, events, packets, memory in order. Each is here in Python and, in ``C``,
+in C."""
 
 from __future__ import annotations
 
 import ctypes
 import os
 import select
+import socket
 import time
 
-from .language import Context, Integers, record_of
+from .language import Bytes, Context, Integers, record_of
 
 MOST_EVENTS = 64
 
@@ -49,6 +51,36 @@ static inline int64_t sioms_fence(void)
     __atomic_thread_fence(__ATOMIC_SEQ_CST);
     return 0;
 }
+
+static inline int64_t sioms_look_at_packet(int64_t sock, uint8_t *to, int64_t at, int64_t most)
+{
+    return recv((int)sock, to + at, (size_t)most, MSG_PEEK | MSG_DONTWAIT | MSG_TRUNC);
+}
+
+static inline int64_t sioms_drop_packet(int64_t sock)
+{
+    char first;
+    return recv((int)sock, &first, 1, MSG_DONTWAIT);
+}
+
+static inline int64_t sioms_send_packet(int64_t sock, uint8_t *packet, int64_t size)
+{
+    return send((int)sock, packet, (size_t)size, MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
+static inline int64_t sioms_first_word_of(int64_t file)
+{
+    int64_t word = 0;
+    return pread((int)file, &word, sizeof word, 0) < 0 ? -1 : word;
+}
+
+static inline int64_t sioms_changed_ns(int64_t file)
+{
+    struct stat found;
+    return fstat((int)file, &found) ? -1 : (int64_t)found.st_mtim.tv_sec * 1000000000 + found.st_mtim.tv_nsec;
+}
+
+static inline int64_t sioms_give_way(void) { return sched_yield(); }
 """
 
 _libc = ctypes.CDLL(None, use_errno=True)
@@ -103,4 +135,55 @@ def wake(pipe: int) -> int:
 
 def fence() -> int:
     """Keep the order of stores before and after for whoever reads the memory."""
+    return 0
+
+
+def look_at_packet(sock: int, to: Bytes, at: int, most: int) -> int:
+    """Copy the beginning of the packet that is next on a socket, which stays there; return its whole length.
+
+    Below 0: there is none. Descriptors that came with it are not opened.
+    """
+    memory = memoryview(to)[at : at + most]  # type: ignore[arg-type]
+    with socket.fromfd(sock, socket.AF_UNIX, socket.SOCK_SEQPACKET) as peer:
+        try:
+            return peer.recv_into(memory, most, socket.MSG_PEEK | socket.MSG_DONTWAIT | socket.MSG_TRUNC)
+        except OSError:
+            return -1
+
+
+def drop_packet(sock: int) -> int:
+    """Take the next packet off a socket."""
+    with socket.fromfd(sock, socket.AF_UNIX, socket.SOCK_SEQPACKET) as peer:
+        return len(peer.recv(1, socket.MSG_DONTWAIT))
+
+
+def send_packet(sock: int, packet: Bytes, size: int) -> int:
+    """Send the first bytes of an array as a packet; below 0: it could not be sent at once."""
+    with socket.fromfd(sock, socket.AF_UNIX, socket.SOCK_SEQPACKET) as peer:
+        try:
+            return peer.send(memoryview(packet)[:size], socket.MSG_DONTWAIT)  # type: ignore[arg-type]
+        except OSError:
+            return -1
+
+
+def first_word_of(file: int) -> int:
+    """Return the first 8 bytes of a file as an int, as many of them as there are; -1: it cannot be read."""
+    try:
+        word = int.from_bytes(os.pread(file, 8, 0), "little")
+    except OSError:
+        return -1
+    return word - (word >> 63 << 64)
+
+
+def changed_ns(file: int) -> int:
+    """Return when a file was last changed [ns, wall clock]; -1: it is not known."""
+    try:
+        return os.fstat(file).st_mtime_ns
+    except OSError:
+        return -1
+
+
+def give_way() -> int:
+    """Let processes of the same real-time priority run."""
+    os.sched_yield()
     return 0

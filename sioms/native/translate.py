@@ -14,21 +14,24 @@ from types import ModuleType
 from typing import Any, get_type_hints
 
 from . import numbers, system
-from .language import ARRAYS, PREFIX, Call, Context, Flags, Floats, Integers, Record, checksum
+from .language import ARRAYS, PREFIX, Bytes, Call, Context, Flags, Floats, Integers, Record, checksum
 
 HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <math.h>
+#include <sched.h>
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/socket.h>
+#include <sys/stat.h>
 #include <sys/timerfd.h>
 #include <time.h>
 #include <unistd.h>
 """
 MATHS = {"sqrt": float, "sin": float, "cos": float, "copysign": float, "exp": float, "expm1": float, "log1p": float}
 EXTERNAL = (numbers, system)
-ELEMENTS = {Floats: float, Integers: int, Flags: int}
+ELEMENTS = {Floats: float, Integers: int, Flags: int, Bytes: int}
 NUMBERS = {int: "int64_t", float: "double", bool: "int64_t", type(None): "void"}
 CALL = "int64_t (*NAME)(void *, int64_t, int64_t, int64_t)"
 OPERATORS: dict[type, str] = {
@@ -62,6 +65,8 @@ def translate(modules: tuple[str, ...]) -> str:
             if isinstance(node, ast.ClassDef) and issubclass(vars(module)[node.name], Record):
                 records.append(_record(vars(module)[node.name]))
             elif isinstance(node, ast.FunctionDef) and any(ast.unparse(d) == "step" for d in node.decorator_list):
+                if node.name in functions:
+                    raise Untranslatable(f"{name}:{node.name}: line {node.lineno}: another step has that name")
                 functions[node.name] = _hints(module, node)
                 found.append((module, node))
     bodies = [_Function(module, node, functions) for module, node in found]

@@ -42,6 +42,8 @@ MAX_UNPACKED = 1 << 24
 MAX_VALUES = 8192
 """Values in the arrays and maps of a request at most: more than a packet holds floating-point numbers."""
 EMSGSIZE = 90
+_SHORT, _SHORT_HEAD = 64, b"\x96\x00"
+"""Bytes of a short reply at most, and how it begins: an array of six, the first of them 0."""
 
 if "site" in sys.modules:
     from msgpack import packb, unpackb
@@ -175,6 +177,26 @@ def decode_reply(packet: bytes, most: int = MAX_PACKET) -> list[Any]:
         if type(message[4]) is bool and type(message[5]) is int and (not message[2] or type(message[3]) is str):
             return message
     raise MalformedMessage("decode reply: not an array of 0, id, errno and value or text")
+
+
+def short_reply(packet: bytes, number: int) -> list[Any] | None:
+    """Unpack a short reply to a request of a number that was done and says when; None for any other packet.
+
+    A reply that this returns is one that ``decode_reply`` returns, and the same.
+    """
+    if len(packet) > _SHORT or packet[:2] != _SHORT_HEAD:
+        return None
+    try:
+        message = _unpack(packet)
+    except Exception:  # whatever it is, decode_reply says it
+        return None
+    if (
+        len(message) == 6 and message[1] == number and type(message[1]) is type(message[2]) is type(message[5]) is int
+        and not message[2] and message[4] is False
+    ):  # fmt: skip
+        whole: list[Any] = message
+        return whole
+    return None
 
 
 def pack_compressed(value: object, level: int = -1) -> bytes:

@@ -380,5 +380,4 @@ def slot_header(raw: bytes) -> tuple[int, int, int]:
 
 def as_of_ns(raw: bytes) -> int:
     """Return the instant up to which a copied snapshot shows everything [ns, CLOCK_MONOTONIC]."""
-    instant: int = _AS_OF.unpack_from(raw, 24)[0]
-    return instant
+    return int.from_bytes(raw[24:32], "little")

@@ -31,7 +31,7 @@ from .handles import LATER, Handle, Quota
 from .parts import Service
 from .requests import ioctl
 from .stops import Reason, Stop
-from .writing import write
+from .writing import take_plain, write
 
 OWNERS, READERS = 0, 1
 SHARES = (0.85, 0.125)
@@ -57,6 +57,8 @@ class Attachments:
         self.handles = handles
         self._service, self._turns, self._tell, self._journal = service, turns, tell, journal
         self._leased: list[Handle] = []
+        self.writers: list[Handle] = []
+        """Handles that may write."""
 
     def check_leases(self, now_ns: int) -> None:
         """End the handles whose clients have been silent for longer than their leases."""
@@ -121,6 +123,8 @@ class Attachments:
         self.handles[number] = handle
         if lease_ns:
             self._leased.append(handle)
+        if handle.writes:
+            self.writers.append(handle)
         kind = OWNERS if exclusive else READERS
         self._turns.add(sock.fileno(), uid, kind, lambda: self._readable(handle))
         if exclusive and handle.pidfd >= 0:
@@ -138,15 +142,21 @@ class Attachments:
             return
         except OSError:
             packet = b""
-        handle.came_ns = time.monotonic_ns()
-        if not handle.passed_on:
-            handle.heard_ns = handle.came_ns
-        try:
+        handle.hear(time.monotonic_ns())
+
+        def serve() -> None:
             if not packet:
                 self.drop(handle)
                 return
             number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
             self._serve(handle, number, message, packet)
+
+        self._guarded(handle, serve)
+
+    def _guarded(self, handle: Handle, serve: Callable[[], None]) -> None:
+        """Serve a client; what goes wrong ends its handle."""
+        try:
+            serve()
         except MalformedMessage as error:
             self._service.log("warning", f"{handle.node}: connection of {handle.who} ended: malformed message: {error}")
             self.end(handle, errno.EPROTO, f"{handle.node}: malformed message: {error}")
@@ -156,6 +166,31 @@ class Attachments:
             trace = "".join(traceback.format_exception(error)[-3:])
             self._service.log("error", f"{handle.node}: the driver failed to serve {handle.who}: {trace}")
             self.end(handle, errno.EIO, f"{handle.node}: the driver failed: {shown(error)}")
+
+    def served(
+        self, handle: Handle, packet: bytes, came_ns: int, effect_ns: int, took_ns: int, unsent: int | None
+    ) -> None:
+        """Work in a plain write that steps have taken and acknowledged (serve_step.py).
+
+        Args:
+            handle, packet: whose, and as it came.
+            came_ns, effect_ns: when it came, and took effect [ns, CLOCK_MONOTONIC].
+            took_ns: how long serving it took [ns].
+            unsent: what its answer would have told, if it could not be sent; else None.
+        """
+        handle.hear(came_ns)
+        self._service.effects.last_ns = effect_ns
+
+        def work_in() -> None:
+            number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
+            _, flags, _, records = (number, *message)
+            take_plain(self._service, handle, flags, records, effect_ns)
+            if unsent is not None:
+                handle.answer(number, unsent)
+            self._note(handle, packet, 0, "")
+
+        self._guarded(handle, work_in)
+        self._turns.charge(handle.sock.fileno(), took_ns)
 
     def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes) -> None:
         if isinstance(message, verbs.Keepalive):
@@ -244,6 +279,8 @@ class Attachments:
             self._service.loop.unwatch(handle.pidfd)
         if handle in self._leased:
             self._leased.remove(handle)
+        if handle.writes:
+            self.writers.remove(handle)
         if handle.every:
             self._service.pages.subscribers(handle.block).remove(handle)
         self._service.waits.forget(handle)

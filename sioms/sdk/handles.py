@@ -117,6 +117,12 @@ class Handle:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
         self.axes = self.channels.tolist()
 
+    def hear(self, now_ns: int) -> None:
+        """Note that a packet of the client has come [ns, CLOCK_MONOTONIC]."""
+        self.came_ns = now_ns
+        if not self.passed_on:
+            self.heard_ns = now_ns
+
     def answer(self, number: int, value: object = None) -> None:
         """Reply to a request; a client that does not read is found dead later, by its socket or its lease."""
         self._send(reply(number, value, self.effects.last_ns))

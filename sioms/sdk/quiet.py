@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from .attachments import Attachments
+    from .desk import WriteDesk
     from .handles import Waits
     from .pages import Pages
     from .stops import Stops
@@ -39,6 +40,7 @@ class QuietRun:
         idling: of the process.
         instants: of a tick, as its step notes them.
         pages, stops, waits, clients, statistics: parts of the process.
+        desk: where writes come in.
 
     Attributes:
         record: after ``take_back``: ``done`` ticks, ``expired`` when the timer has been read and the tick is the
@@ -50,7 +52,9 @@ class QuietRun:
         self, steps: QuietSteps, poll: int, timer: int, line_timer: int, control: int, latch: NDArray[np.int64],
         period_ns: int, lead_ns: int, daemon_lease_ns: int, idling: Idling, instants: NDArray[np.int64],
         pages: Pages, stops: Stops, waits: Waits, clients: Attachments, statistics: TickStatistics,
+        desk: WriteDesk,
     ) -> None:  # fmt: skip
+        self.desk = desk
         self._idling = idling
         self._steps, self._pages, self._stops, self._waits = steps, pages, stops, waits
         self._clients, self._statistics = clients, statistics
@@ -59,8 +63,8 @@ class QuietRun:
             poll=poll, timer=timer, line_timer=line_timer, ready=self._ready, latch=latch, stopped=0, resets=0,
             orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
             announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
-            tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, early_ns=0, heeded_ns=0,
-            brakes=0, patient=0, control=control, called=0, spare=np.zeros(MOST_EVENTS, dtype=np.int64),
+            tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, desk=desk.record, early_ns=0,
+            heeded_ns=0, brakes=0, patient=0, control=control, called=0, spare=np.zeros(MOST_EVENTS, dtype=np.int64),
             instants=instants, scheduled_ns=0, ticked_ns=0, began_ns=0, number=0, waiting=0, left=0, done=0, expired=0,
             slackens=0, ring=statistics.ring.reshape(-1), ticks=0, skipped=0, longest_ns=0,
         )  # fmt: skip
@@ -83,6 +87,7 @@ class QuietRun:
         until_ns = self._waits.until_ns()
         if not until_ns or not self._steps.is_ready(watched) or not self._pages.lend():
             return False
+        self.desk.lend()
         record.until_ns = min(until_ns, self._clients.until_ns())
         record.stopped, record.resets, record.orders = self._stops.seen
         record.scheduled_ns, record.number = scheduled_ns, number
@@ -114,7 +119,7 @@ class QuietRun:
 def quiet_run(
     driver: Driver, poll: int, timer: int, line_timer: int, control: int, latch: NDArray[np.int64], period_ns: int,
     lead_ns: int, daemon_lease_ns: int, idling: Idling, pages: Pages, stops: Stops, waits: Waits,
-    clients: Attachments, statistics: TickStatistics,
+    clients: Attachments, statistics: TickStatistics, desk: WriteDesk,
 ) -> QuietRun | None:  # fmt: skip
     """Return what ticks by compiled steps, see QuietRun; None for a driver that has none, or without a library."""
     if library is None or not isinstance(driver, TickDriver) or any(block.spec.writable for block in driver.blocks):
@@ -123,5 +128,5 @@ def quiet_run(
     steps = driver.quiet_steps(pages, instants)
     return None if steps is None else QuietRun(
         steps, poll, timer, line_timer, control, latch, period_ns, lead_ns, daemon_lease_ns, idling, instants, pages,
-        stops, waits, clients, statistics,
+        stops, waits, clients, statistics, desk,
     )  # fmt: skip

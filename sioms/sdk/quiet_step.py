@@ -1,5 +1,7 @@
 """Ticks in which nothing happens but motion: from one wait of the process to the next event that is more than that.
 
+Plain writes of clients are served, too (serve_step.py); the tick that carries them out is the loop's.
+
 ``run`` waits as the loop does. What is due is done here as long as the timer is all that is ready, nobody has asked for
 a stop, no lease runs out, and the driver's own step has nothing to tell. Everything else is the loop's (runtime.py),
 which finds a state as if it had done the ticks itself.
@@ -11,6 +13,8 @@ from typing import Final
 
 from sioms.native.language import Call, Context, Integers, Record, step
 from sioms.native.system import MOST_EVENTS, clock_ns, expirations, fence, record_at, set_timer, wait_for, wake
+
+from .serve_step import Desk, serve_packet, writer_of
 
 STOPPED: Final = 0
 RESETS: Final = 1
@@ -69,6 +73,8 @@ class Quiet(Record):
     its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
     else it is idle when it has been at rest for ``rest_ns`` since ``restless_ns``, and ``told`` is RESTED or STIRS.
 
+    ``desk`` serves writes.
+
     ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: the loop has yet to
     see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: it is a stop
     that steps have begun. ``patient``: the device waits for its turn in a process of several, and ticks on meanwhile.
@@ -106,6 +112,7 @@ class Quiet(Record):
     slack: Call
     rest: Call
     stop: Call
+    desk: Desk
     early_ns: int
     heeded_ns: int
     brakes: int
@@ -223,8 +230,11 @@ def may_tick(q: Quiet, now_ns: int) -> int:
     """Return whether there is nothing that the loop has to see to before a tick.
 
     A stop is begun; orders that come behind it have time. Who waits for its turn ticks on before an order, and before a
-    reset as one who is stopped; one who has missed a stop and its reset does not.
+    reset as one who is stopped; one who has missed a stop and its reset does not. Writes that have been served
+    are worked in by the loop.
     """
+    if q.desk.kept:
+        return 0
     if q.latch[RESETS] != q.resets:
         if not q.patient or not q.stopped:
             return 0
@@ -298,6 +308,8 @@ def announce(q: Quiet) -> int:
     """Do the slack of a tick before it, and have the other timer begin it; return what has become of this one."""
     due_ns = q.scheduled_ns + (q.announced + q.expired) * q.period_ns
     began_ns = clock_ns()
+    if q.desk.kept:
+        return LEFT
     if q.slack(q.device, began_ns, due_ns, 0):
         return LEFT
     q.announced += q.expired
@@ -323,8 +335,19 @@ def heed_timer(q: Quiet, fd: int) -> int:
 
 
 @step
+def serve_writer(q: Quiet, who: int) -> int:
+    """Serve the next packet of a writer, unless something has been asked for that comes before it; return what has
+    become of it.
+    """
+    if q.heeded_ns or q.latch[STOPPED] or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders:
+        return LEFT
+    return LEFT if serve_packet(q.desk, who, q.number) else DONE
+
+
+@step
 def heed(q: Quiet, count: int) -> int:
-    """Do what some descriptors that are ready ask for, as far as it is ticks; return whether the loop has to go on.
+    """Do what some descriptors that are ready ask for, as far as it is ticks, or a write where nothing else is left;
+    return whether the loop has to go on.
 
     Both timers are ready when a tick was missed.
     """
@@ -341,6 +364,10 @@ def heed(q: Quiet, count: int) -> int:
             left += 1
         elif found == HEARD:
             heard = 1
+    if left == 1 and not heard and not q.left:
+        who = writer_of(q.desk, q.ready[0])
+        if who >= 0 and serve_writer(q, who) == DONE:
+            left = 0
     q.waiting = left
     return left or heard
 

@@ -36,6 +36,7 @@ from .alarm_watch import AlarmWatch
 from .attachments import SHARES, Attachments
 from .blocks import AnyBlock, AxisBlock
 from .control import Control
+from .desk import WriteDesk
 from .driver import AtLimitError, Driver
 from .effects import Effects
 from .engines import make_engine
@@ -146,6 +147,8 @@ class Runtime:
         self._announced = self._slack_ns = self._spare_until_ns = 0
         self._expired, self.sees_requests = 0, False
         self._quiet: QuietRun | None = None
+        self._is_alone = False
+        """Whether the process is this device's alone."""
 
     # --- services to the driver (Kit) ------------------------------------------------------------
 
@@ -237,6 +240,7 @@ class Runtime:
 
     def run(self, priority: int, user: str) -> int:
         """Tick until told to end; return the exit status."""
+        self._is_alone = True
         self._watch_requests()  # before that user may not look at it any more
         settle(priority, user, self.log)
         try:
@@ -268,10 +272,12 @@ class Runtime:
         """Return what ticks by compiled steps; None where a tick has to look at more than they do."""
         if self._stops_workcell or self.pages.watch or not self.sees_requests:
             return None
+        request = self._request_fd if self._is_alone else -1
+        desk = WriteDesk(self.blocks, self.clients, self.stops, self.pages, request, self.turns.gives_way)
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._control.fileno(),
             self._latch_words, self.period_ns, self._lead_ns, self._daemon_lease_ns, self._idling, self.pages,
-            self.stops, self.waits, self.clients, self.statistics,
+            self.stops, self.waits, self.clients, self.statistics, desk,
         )  # fmt: skip
 
     def _watch_requests(self) -> None:
@@ -366,6 +372,7 @@ class Runtime:
         """Go on after ``lend``; return the descriptors that are ready."""
         ready = quiet.take_back()
         self._resume(quiet.record)
+        quiet.desk.take_back(self.tick)
         if quiet.record.heeded_ns:
             self.heed_requests()
             self._brakes = False

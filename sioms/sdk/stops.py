@@ -146,6 +146,11 @@ class Stops:
         """What has been seen: the time of the workcell's stop [ns], how often it was reset, orders of the daemon."""
         return (*self._seen[:2], self._orders)
 
+    @property
+    def seen_request(self) -> tuple[int, int]:
+        """The mark of the stop-request file that has been seen."""
+        return self._seen[2]
+
     def heed_orders(self) -> bool:
         """Return whether the daemon has sent orders since the last look; cheap."""
         orders = self._latch.orders

@@ -66,16 +66,34 @@ def write(service: Service, handle: Handle, number: int, flags: int, timeout_s: 
             except CommandError as error:
                 raise OSError(error.errno, f"{what}: {error}") from None
         # One or a few records need no array; behind an earlier write that is not taken yet they wait their turn.
-        if len(data) <= _AT_ONCE * size and not handle.writing:
-            short = list(record.iter_unpack(data))
-            if block.bank.offer(short, handle.axes, service.loop.now_ns(), replace=bool(flags & _REPLACE)):
-                service.engine.commands_written(block)
-                return service.loop.tick
+        is_short = len(data) <= _AT_ONCE * size and not handle.writing
+        if is_short and _offer(service, handle, flags, data, service.loop.now_ns()):
+            return service.loop.tick
         return _write_axes(service, handle, number, flags, timeout_s, np.frombuffer(data, _DTYPE[node_class]))
     records = np.frombuffer(data, _DTYPE[node_class])
     changes = _changes(handle, records, what)
     _take_responsibility(service, block, changes, what)
     return service.engine.write_outputs(handle, number, block, changes)
+
+
+def take_plain(service: Service, handle: Handle, flags: int, data: bytes, now_ns: int) -> None:
+    """Take records that steps have found plain and good, and have acknowledged.
+
+    Raises:
+        ValueError: they are not; the client has been told what is not true.
+    """
+    if not _offer(service, handle, flags, data, now_ns):
+        raise ValueError(f"write {handle.node}: acknowledged by steps and not taken by the bank")
+
+
+def _offer(service: Service, handle: Handle, flags: int, data: bytes, now_ns: int) -> bool:
+    """Take a short write at once, if it is plain."""
+    block = handle.block
+    short = list(WRITE_STRUCT[NodeClass.AXIS].iter_unpack(data))
+    taken: bool = block.bank.offer(short, handle.axes, now_ns, replace=bool(flags & _REPLACE))  # type: ignore[union-attr]
+    if taken:
+        service.engine.commands_written(block)
+    return taken
 
 
 def check_link(service: Service, handle: Handle, what: str) -> None:

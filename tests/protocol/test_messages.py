@@ -9,6 +9,8 @@ import zlib
 
 import msgpack
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from sioms.protocol.driver_verbs import (
     FROM_DRIVER,
@@ -59,6 +61,7 @@ from sioms.protocol.messages import (
     encode,
     refusal,
     reply,
+    short_reply,
     value_of,
 )  # fmt: skip
 from sioms.protocol.records import ANALOG_WRITE, AXIS_WRITE, BINARY_WRITE
@@ -400,3 +403,24 @@ def test_a_text_is_made_fit_for_a_terminal(text: str) -> None:
     shown = decode_reply(refusal(1, 5, text))[3]
     assert shown.isprintable() and 0 < len(shown) <= MAX_TEXT
     assert decode_reply(encode(0, 1, 5, text.encode("utf-8", "replace").decode()))[3].isprintable()
+
+
+@given(
+    st.lists(st.one_of(st.integers(-5, 70), st.booleans(), st.none(), st.floats(), st.text(max_size=5)), max_size=7),
+    st.binary(max_size=3),
+)
+def test_a_short_reply_is_one_that_every_reader_takes_for_the_same(parts: list[object], behind: bytes) -> None:
+    usual = [0, 7, 0, 1, False, 99]
+    for message in (parts, [*usual[: len(parts) % 6], *parts][:6], usual):
+        packet = encode(*message) + behind
+        found = short_reply(packet, 7)
+        if found is not None:
+            assert found == decode_reply(packet) and found[1] == 7 and found[2] == 0
+        else:
+            assert behind or message != usual
+
+
+def test_a_long_reply_is_no_short_one() -> None:
+    assert short_reply(reply(7, "x" * 100, 99), 7) is None and short_reply(reply(7, 5, 99), 8) is None
+    assert short_reply(reply(7, 5), 7) is None and short_reply(refusal(7, 5, "no", 99), 7) is None
+    assert short_reply(reply(7, 5, 99), 7) == [0, 7, 0, 5, False, 99]

@@ -9,7 +9,7 @@ import socket
 import threading
 import time
 from _thread import allocate_lock
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -17,7 +17,7 @@ import pytest
 from sioms.client.channel import KEEPALIVE, Call, Channel, connect
 from sioms.client.overdue import GRACE_S
 from sioms.protocol.messages import ClientVerb, decode, encode, refusal, reply
-from sioms.protocol.verbs import Ioctl, Subscribe
+from sioms.protocol.verbs import Ioctl, Subscribe, Write
 
 
 class Peer:
@@ -33,9 +33,19 @@ class Peer:
     def ask(self, word: object, limit_s: float | None = None) -> int:
         """Let a thread ask; return the number of its request when it has come."""
 
+        return self.start(word, lambda: self.channel.call(Call("ask", Ioctl(1, word, None), limit_s=limit_s)).value)
+
+    def write(self, word: object, limit_s: float = 0.0) -> int:
+        """Let a thread write, in few steps if it can."""
+        call = Call("write", Write(1, limit_s, b"data"), limit_s=limit_s)
+        return self.start(word, lambda: self.channel.short_call((1, 1, limit_s, b"data"), lambda: call))
+
+    def start(self, word: object, ask: Callable[[], object]) -> int:
+        """Let a thread ask for something; return the number of its request when it has come."""
+
         def run() -> None:
             try:
-                self.results[word] = self.channel.call(Call("ask", Ioctl(1, word, None), limit_s=limit_s)).value
+                self.results[word] = ask()
             except OSError as error:
                 self.results[word] = error
 
@@ -224,3 +234,81 @@ def test_a_request_renews_what_is_kept_alive_with_its_channel_however_soon_it_is
     for peer in peers:
         peer.channel.close()
         peer.sock.close()
+
+
+def acquainted(peer: Peer) -> list[int]:
+    """Let the channel have asked something before; return the instants that are acknowledged to it."""
+    told: list[int] = []
+    peer.channel.acknowledged = told.append
+    peer.sock.send(reply(peer.ask("first"), 1))
+    peer.join()
+    return told
+
+
+def test_a_short_call_is_the_same_packet_and_tells_the_same(peer: Peer) -> None:
+    told = acquainted(peer)
+    peer.start("write", lambda: peer.channel.short_call((1, 1, 0.5, b"data"), lambda: pytest.fail("another way")))
+    peer.sock.send(reply(2, 4711, 99))
+    assert peer.join()["write"] == 4711 and told == [99]
+    number = peer.write("packet", 0.5)
+    assert number == 3 and not peer.channel._answers
+    peer.sock.send(reply(number, 1, 100))
+    assert peer.join()["packet"] == 1 and told == [99, 100]
+
+
+@pytest.mark.parametrize("how", ["refused", "without an instant", "another first", "ended", "gone", "nonsense", "long"])
+def test_what_is_not_the_usual_answer_to_a_short_call_is_told_as_ever(peer: Peer, how: str) -> None:
+    told = acquainted(peer)
+    number = peer.write("write")
+    match how:
+        case "refused":
+            peer.sock.send(refusal(number, errno.ERANGE, "too far", 77))
+        case "without an instant":
+            peer.sock.send(reply(number, 5))
+        case "another first":
+            peer.sock.send(reply(number + 100, 1, 66))
+            peer.sock.send(reply(number, 5, 77))
+        case "ended":
+            peer.sock.send(refusal(0, errno.ETIMEDOUT, "the lease"))
+        case "gone":
+            peer.sock.close()
+        case "nonsense":
+            peer.sock.send(b"\x96\x00nonsense")
+        case _:
+            peer.sock.send(reply(number, "x" * 100, 77))
+    found = peer.join()["write"]
+    if how in ("without an instant", "another first", "long"):
+        assert found == ("x" * 100 if how == "long" else 5)
+    else:
+        known = {"refused": errno.ERANGE, "ended": errno.ETIMEDOUT, "gone": errno.EIO, "nonsense": errno.EPROTO}
+        assert isinstance(found, OSError) and found.errno == known[how]
+    assert told == ([77] if how in ("refused", "another first", "long") else [])
+    assert set(peer.channel._answers) == ({number + 100} if how == "another first" else set())
+
+
+def test_a_short_call_that_is_late_is_told_in_time_and_cancelled(peer: Peer) -> None:
+    acquainted(peer)
+    began_s = time.monotonic()
+    number = peer.write("late", 0.1 - GRACE_S)
+    assert isinstance(peer.join()["late"], OSError) and time.monotonic() - began_s < 8.0
+    verb, _, *what = decode(peer.sock.recv(65536))
+    assert (verb, what) == (ClientVerb.CANCEL, [number])
+
+
+def test_short_calls_of_many_threads_each_get_their_own_answer(peer: Peer) -> None:
+    acquainted(peer)
+    numbers = [peer.write(word) for word in range(4)]
+    for i in (2, 0, 3, 1):
+        peer.sock.send(reply(numbers[i], i * 10, 1000 + i))
+    found = peer.join()
+    assert [found[i] for i in range(4)] == [0, 10, 20, 30]
+
+
+def test_the_time_out_of_the_socket_is_set_once_for_all_writes(peer: Peer, monkeypatch: pytest.MonkeyPatch) -> None:
+    acquainted(peer)
+    call, timeouts = Call("write", Write(1, 0.0, b"data")), []
+    for _ in range(5):
+        peer.sock.send(reply(peer.channel.send(call), 1))
+        peer.channel.wait(peer.channel._number, call)
+        timeouts.append(peer.channel._timeout)
+    assert set(timeouts) == {1.0}

@@ -38,6 +38,7 @@ from sioms.sdk.quiet_step import (
     wait_turn,
 )
 from sioms.sdk.rt import TimerFd
+from sioms.sdk.serve_step import Desk
 
 PERIOD_NS, LEASE_NS = 1_000_000, 60_000_000_000
 STEP = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
@@ -70,7 +71,7 @@ class Device:
             "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
             "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
             "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0, "patient": 0, "called": 0,
-            "control": self.control, "spare": np.zeros(64, dtype=np.int64),
+            "control": self.control, "desk": Desk.empty(), "spare": np.zeros(64, dtype=np.int64),
             "done": 0, "expired": 1, "slackens": 0, "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
         }  # fmt: skip
         for name, function in (
@@ -373,6 +374,7 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
         SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
         SimpleNamespace(lend=lambda: lends), SimpleNamespace(seen=(3, 2, 1)),
         SimpleNamespace(until_ns=lambda: waits_ns), SimpleNamespace(until_ns=lambda: clients_ns), statistics,
+        SimpleNamespace(record=Desk.empty(), lend=lambda: None),
     )  # fmt: skip
     record.close()
     return quiet

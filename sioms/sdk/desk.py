@@ -1,0 +1,98 @@
+"""Writes that compiled steps have taken while the process waited: which clients they may serve, and what follows.
+
+Concurrency: the one thread of the driver process.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .blocks import AnyBlock, AxisBlock
+from .serve_step import MOST_KEPT, MOST_WRITERS, REPLY, ROOM, Desk
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from .attachments import Attachments
+    from .handles import Handle
+    from .pages import Pages
+    from .stops import Stops
+
+
+class WriteDesk:
+    """Lends the writers of a device's first axes to steps.
+
+    Args:
+        blocks: of the device.
+        clients: its handles.
+        stops, pages: of the process.
+        request: descriptor of the stop-request file; below 0: no writes are served by steps.
+        gives_way: whether processes of the same priority may run after every packet.
+    """
+
+    def __init__(
+        self, blocks: Sequence[AnyBlock], clients: Attachments, stops: Stops, pages: Pages, request: int,
+        gives_way: bool,
+    ) -> None:  # fmt: skip
+        self._clients, self._stops, self._pages = clients, stops, pages
+        self._writers: list[Handle] = []
+        self._packets = np.zeros(MOST_KEPT * ROOM, dtype=np.uint8)
+        axes = [block for block in blocks if isinstance(block, AxisBlock)] if request >= 0 else []
+        plain = axes[0].bank.plain if axes else None
+        self._block = axes[0] if plain is not None else None
+        if plain is None:
+            self.record = Desk.empty()
+            return
+
+        def row(count: int) -> NDArray[np.int64]:
+            return np.zeros(count, dtype=np.int64)
+
+        self.record = Desk(
+            plain=plain, count=0, fds=row(MOST_WRITERS), first=row(MOST_WRITERS), known=row(MOST_WRITERS),
+            axes=row(axes[0].n), request=request, word=0, changed=0, gives_way=int(gives_way),
+            packets=self._packets, kept=0, size=row(MOST_KEPT), writer=row(MOST_KEPT),
+            came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
+            replace=0, at=0, records=0, reply=np.zeros(REPLY, dtype=np.uint8),
+        )  # fmt: skip
+
+    def lend(self) -> None:
+        """Let steps serve the writers whose next packet has nothing to wait for."""
+        block, record = self._block, self.record
+        if block is None:
+            return
+        record.count = record.kept = record.waiting = 0
+        if self._stops.stopped or block.admits is not None or not block.bank.defers or self._pages.why_not(block):
+            return
+        writers = [
+            handle
+            for handle in self._clients.writers
+            if handle.block is block and not (handle.writing or handle.waits or handle.ahead[1] or handle.halted)
+        ][:MOST_WRITERS]
+        if writers != self._writers:
+            self._list(writers)
+        word, record.changed = self._stops.seen_request
+        record.word = word - (word >> 63 << 64)
+        record.count = len(writers)
+
+    def _list(self, writers: list[Handle]) -> None:
+        record, first = self.record, 0
+        self._writers = writers
+        for i, handle in enumerate(writers):
+            record.fds[i], record.first[i], record.known[i] = handle.sock.fileno(), first, len(handle.axes)
+            for axis in handle.axes:
+                record.axes[first] = axis
+                first += 1
+
+    def take_back(self, tick: int) -> None:
+        """Work in the writes that have been served; ``tick``: that their answers have told."""
+        record = self.record
+        kept, record.kept = record.kept, 0
+        for i in range(kept):
+            packet = bytes(self._packets[i * ROOM : i * ROOM + record.size[i]])
+            self._clients.served(
+                self._writers[record.writer[i]], packet, int(record.came[i]), int(record.effect[i]),
+                int(record.took[i]), None if record.sent[i] else tick,
+            )  # fmt: skip

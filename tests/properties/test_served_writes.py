@@ -1,0 +1,112 @@
+"""Writes that steps serve are those that the loop takes at once, with the same answer; all others are left to it."""
+
+import os
+import random
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import served_writes_rig
+from served_writes_rig import AXES, TICK, Served, packets, queue_of
+
+from sioms.native.language import UNCOMPILED
+from sioms.protocol import verbs
+from sioms.protocol.messages import MalformedMessage, decode_reply, reply
+from sioms.protocol.records import AXIS_WRITE
+from sioms.sdk import attachments  # adds the decoders of a driver
+from sioms.sdk.serve_step import MOST_KEPT, ROOM
+
+
+@pytest.fixture
+def request_file():
+    fd = os.memfd_create("request")
+    yield fd
+    os.close(fd)
+
+
+def taken(queue, packet, waiting):
+    """Return message number and count of records, if the loop takes a packet at once; else None."""
+    try:
+        number, message = verbs.take(packet, verbs.ON_HANDLE)
+    except MalformedMessage:
+        return None
+    if not isinstance(message, verbs.Write):
+        return None
+    flags, _, data = message
+    if not data or len(data) % AXIS_WRITE.size:
+        return None
+    records = list(AXIS_WRITE.iter_unpack(data))
+    commands = queue.admit_plain(records, AXES, waiting, replace=bool(flags & 1))
+    return None if commands is None else (number, len(records))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_steps_serve_is_what_the_loop_takes_at_once(seed, request_file):
+    chance = random.Random(seed)
+    made, served_count, usual_left = packets(chance), 0, 0
+    assert attachments.SHARES and verbs.ON_HANDLE.decoders
+    for _ in range(400):
+        queue = queue_of(chance)
+        served, waiting, kept = Served(queue, request_file), 0, 0
+        for _ in range(chance.randrange(1, 7)):
+            packet, is_usual = next(made)
+            if not packet:
+                continue
+            wanted = taken(queue, packet, waiting)
+            if served.serve(packet):
+                assert wanted is not None and kept < MOST_KEPT
+                answer = served.answer()
+                desk = served.desk
+                assert answer == reply(wanted[0], TICK, int(desk.effect[kept])) and decode_reply(answer)[1] == wanted[0]
+                place = kept * ROOM
+                assert bytes(desk.packets[place : place + desk.size[kept]]) == packet and not served.left()
+                assert desk.came[kept] <= desk.effect[kept] and desk.took[kept] > 0 and desk.sent[kept]
+                waiting, kept = waiting + wanted[1], kept + 1
+                served_count += 1
+            else:
+                assert served.left() == packet and not served.answer(), "it is left to the loop as it came"
+                if wanted is not None and is_usual and len(packet) <= ROOM:
+                    assert kept == MOST_KEPT, "the usual write is served"
+                    usual_left += 1
+            assert (served.desk.waiting, served.desk.kept) == (waiting, kept)
+        served.close()
+    assert served_count > 100 and usual_left < served_count
+
+
+def test_both_forms_of_the_steps_do_the_same():
+    def run(**more):
+        environment = {key: value for key, value in os.environ.items() if key != UNCOMPILED} | more
+        command = [sys.executable, str(Path(served_writes_rig.__file__)), "7", "150"]
+        return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split("\n")
+
+    compiled, plain = run(), run(**{UNCOMPILED: "1"})
+    assert (compiled[0], plain[0]) == ("compiled", "python"), "./dev setup compiles the steps"
+    assert compiled[1:] == plain[1:] and sum(line.startswith("True") for line in plain) > 30
+
+
+def test_a_stop_that_is_asked_for_comes_before_the_next_write(request_file):
+    chance = random.Random(1)
+    queue = queue_of(chance)
+    queue.latched[:] = 0
+    queue.home_required[:] = False
+    packet = next(p for p, _ in packets(chance) if taken(queue, p, 0) is not None and len(p) < 200)
+    served = Served(queue, request_file)
+    assert served.serve(packet)
+    os.pwrite(request_file, b"\1", 0)
+    assert not served.serve(packet) and served.left() == packet
+    served.close()
+
+
+def test_a_client_that_does_not_read_its_answers_is_the_loops(request_file):
+    queue = queue_of(random.Random(0))
+    queue.latched[:] = 0
+    queue.home_required[:] = False
+    packet = next(p for p, _ in packets(random.Random(2)) if taken(queue, p, 0) is not None and len(p) < 200)
+    served = Served(queue, request_file)
+    with pytest.raises(BlockingIOError):
+        while True:
+            served.theirs.send(bytes(1000))
+    assert not served.serve(packet)
+    assert served.desk.kept == 1 and not served.desk.sent[0] and not served.left(), "it is taken, and not answered"
+    served.close()
