@@ -11,7 +11,7 @@ import argparse
 import errno
 import ipaddress
 import sys
-import threading
+import time
 from collections.abc import Callable, Iterable, Iterator
 from time import monotonic
 from typing import Any, TypeAlias
@@ -24,6 +24,7 @@ from sioms.arguments import place, positive
 from sioms.bridges.leases import LEASE_S, Leases
 from sioms.bridges.putters import Putters
 from sioms.client.workcell import Workcell, is_part
+from sioms.ending import end_well
 from sioms.protocol.flags import READONLY, AnalogStatus, AxisStatus, NodeClass, Severity
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.protocol.text import printable
@@ -70,11 +71,11 @@ def run(args: argparse.Namespace) -> int:
     bridge = Bridge(args.prefix, putters, Leases() if args.move else None)
     with serve(bridge.provider, host, port) as server:
         putters.here = (host, int(server.conf()["EPICS_PVAS_SERVER_PORT"]))
+        end_well()
         print(f"listening on {args.listen}", file=sys.stderr, flush=True)
-        ended = threading.Event()
-        while not ended.wait(1.0 / args.rate):
+        while True:
+            time.sleep(1.0 / args.rate)
             bridge.look()
-    return 0
 
 
 def is_loopback(host: str) -> bool:

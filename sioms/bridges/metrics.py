@@ -22,6 +22,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 
 from sioms.arguments import place
 from sioms.client.workcell import NodeEntry, Workcell, is_part
+from sioms.ending import end_well
 from sioms.protocol.flags import READONLY, AnalogStatus, AxisStatus, NodeClass, Severity
 from sioms.protocol.nodeinfo import NodeInfo
 
@@ -61,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
     except (OSError, OverflowError) as error:
         why = getattr(error, "strerror", None) or str(error)
         raise OSError(getattr(error, "errno", None) or errno.EINVAL, f"listen on {args.listen}: {why}") from None
+    end_well()
     print(f"listening on http://{args.listen}/metrics", file=sys.stderr, flush=True)
     with server:
         server.serve_forever()

@@ -22,6 +22,7 @@ import zenoh
 from sioms.arguments import positive, whole
 from sioms.client.node import Node
 from sioms.client.workcell import NodeEntry, Workcell, is_part
+from sioms.ending import end_well
 from sioms.protocol.flags import READONLY, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.text import printable
@@ -61,6 +62,7 @@ def run(args: argparse.Namespace) -> int:
         with Workcell(name="sioms ros2") as cell:
             bridge = Bridge(session, cell, args.domain, ros.part(args.prefix or cell.name))
             print(f"publishing below /{bridge.prefix} to {args.router}", file=sys.stderr, flush=True)
+            end_well()
             due_s = time.monotonic()
             while True:
                 bridge.look()

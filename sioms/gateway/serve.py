@@ -8,7 +8,6 @@ from __future__ import annotations
 import errno
 import os
 import select
-import signal
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -16,6 +15,7 @@ from functools import partial
 
 from sioms.client.keys import Folder
 from sioms.client.wall import wall
+from sioms.ending import on_end
 from sioms.notify import ServiceManager
 from sioms.protocol.clock import Wall
 from sioms.protocol.text import printable
@@ -199,8 +199,8 @@ class Serve:
         manager.tell("STOPPING=1")
         self.close()
 
-    def end(self, *_: object) -> None:
-        """Have the loop end, as a signal's handler."""
+    def end(self) -> None:
+        """Have the loop end."""
         self._ending = True
 
     def close(self) -> None:
@@ -232,8 +232,7 @@ def serve(path: str, folder: Folder, *, zmq: tuple[str, int] | None, zenoh: tupl
         from .zenoh import Zenoh
 
         gateway.transports.append(Zenoh(gateway, path, *zenoh, folder))
-    signal.signal(signal.SIGTERM, gateway.end)
-    signal.signal(signal.SIGINT, gateway.end)
+    on_end(gateway.end)
     for each in gateway.transports:
         log("info", "ready", **each.about, keys=folder.path)
     gateway.run()

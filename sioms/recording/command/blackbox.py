@@ -15,6 +15,7 @@ from typing import Any
 from sioms.arguments import positive
 from sioms.client.workcell import Workcell
 from sioms.documents import json_text
+from sioms.ending import on_end
 from sioms.prompt import be_prompt
 from sioms.recording.live.box import KEPT_S, Box
 from sioms.recording.live.recorder import Recorder
@@ -108,13 +109,12 @@ def _keep(folder: Path, memory: int, seconds: float) -> int:
         raise OSError(errno.EBUSY, text)
     ended = False
 
-    def end(_number: int, _frame: object) -> None:
+    def end() -> None:
         nonlocal ended
         ended = True
 
     box = Box(folder, memory, seconds)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end)
+    on_end(end)
     signal.signal(signal.SIGUSR1, lambda *_: box.ask("request"))
     recorder: Recorder | None = None
     while recorder is None and not ended:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 import re
-import signal
 import sys
 import time
 from typing import Any
 
 from sioms.arguments import LARGEST, positive
 from sioms.client.workcell import Workcell
+from sioms.ending import on_end
 from sioms.prompt import be_prompt
 from sioms.recording.live.files import LiveFile
 from sioms.recording.live.recorder import Recorder
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     """Record; return the exit status: 1 if the recording ended before it was to."""
     ended = False
 
-    def end(_number: int, _frame: object) -> None:
+    def end() -> None:
         nonlocal ended
         ended = True
 
@@ -66,8 +66,7 @@ def run(args: argparse.Namespace) -> int:
     except OSError:
         sink.drop()
         raise
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, end)
+    on_end(end)
     be_prompt()
     began_s = told_s = time.monotonic()
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -12,6 +11,7 @@ from typing import Any
 
 from sioms.arguments import positive
 from sioms.children import ends_with_us
+from sioms.ending import on_end
 from sioms.recording.live.replay import Replay
 from sioms.recording.reader import Recording
 
@@ -35,14 +35,13 @@ def run(args: argparse.Namespace) -> int:
     """Serve; return the exit status, of the command if there is one."""
     ended = False
 
-    def end(_number: int, _frame: object) -> None:
+    def end() -> None:
         nonlocal ended
         ended = True
 
     with tempfile.TemporaryDirectory(prefix="sioms-replay-") as folder, Recording(args.file) as recording:
         replay = Replay(recording, args.socket or os.path.join(folder, "siomsd.sock"), args.rate)
-        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            signal.signal(number, end)
+        on_end(end)
         child: subprocess.Popen[bytes] | None = None
         if args.words:
             environment = {**os.environ, "SIOMS_SOCKET": replay.path}

@@ -1,0 +1,36 @@
+"""What serves until it is told to end leaves its blocks and ends with status 0, whichever signal told it."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+SIOMS = Path(__file__).resolve().parents[2] / "sioms"
+SERVES = ["bridges/epics.py", "bridges/metrics.py", "bridges/ros2.py", "gateway/serve.py"] + [
+    f"recording/command/{name}.py" for name in ("blackbox", "record", "replay")
+]
+PROGRAM = """
+import contextlib, time
+from sioms.ending import end_well
+with contextlib.ExitStack() as stack:
+    stack.callback(print, "left", flush=True)
+    end_well()
+    print("serves", flush=True)
+    time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_who_is_told_to_end_has_not_failed(number: signal.Signals) -> None:
+    with subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout is not None and process.stdout.readline() == "serves\n"
+        process.send_signal(number)
+        assert process.communicate(timeout=30)[0] == "left\n" and process.returncode == 0
+
+
+@pytest.mark.parametrize("name", SERVES)
+def test_what_serves_has_the_one_way_to_end(name: str) -> None:
+    text = (SIOMS / name).read_text()
+    assert "from sioms.ending import" in text and "signal.SIGTERM" not in text
