@@ -61,7 +61,7 @@ def bench_light(options: Options, report: Report) -> None:
         _size(report, pid)
         _stops(options, report, cell, nodes)
         states = {device["name"]: device["state"] for device in cell.status()["devices"]}
-        faults = [name for name, state in states.items() if state != "running"]
+        faults = [name for name, state in states.items() if state != "up"]
         report.value("devices in fault", len(faults) + _axes_in_fault(nodes), "", bars=[Bar("value", 0)],
                      notes=" ".join(faults))  # fmt: skip
 
