@@ -74,6 +74,8 @@ def frozen(station: Station, full: bool) -> str:
                     f"the link is good, flags {flags}",
                 )
             lost_s = time.monotonic() - began
+            if wait_for(station.is_good, WATCH_S):
+                raise Failed("a link that stays lost while the stream stands still", "it is good again")
         finally:
             device.tell("freeze 0")
         check_back(station)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from .device import (
@@ -34,36 +35,50 @@ def lost_stop(station: Station, full: bool) -> str:
     axis = first_axis(station)
     fast = usual_speed(station, axis)
     texts = []
-    for name, begin, end in _hindrances(station):
-        for way in ("stop", "emergency stop", "close"):
-            with station.cell.open(f"{axis.node}.readonly") as seen:
-                node = station.cell.open(axis.node, "rw", timeout=5.0)
-                try:
-                    restore(station, node, axis)
-                    run(station, node, axis)
-                    wait_moving(station, node.read, axis)
-                    begin()
-                    began = time.monotonic()
-                    with contextlib.suppress(OSError):
-                        stop_by(station, node, way)
-                    time.sleep(SILENT_S)
-                    end()
-                    check_stops(station, fast, f"{way}, {name}")
-                    texts.append(1e3 * (time.monotonic() - began))
-                    check_back(station)
-                    check_still(station, fast, WATCH_S / 2, f"{way}, {name}")
-                    wait_for(lambda: not seen.read().in_motion[0], 2.0)
-                finally:
-                    end()
-                    with contextlib.suppress(OSError):
-                        node.close()
-                    station.cell.reset()
+    for (name, begin, end), way in _tried(_hindrances(station), ("stop", "emergency stop", "close"), full):
+        with station.cell.open(f"{axis.node}.readonly") as seen:
+            node = station.cell.open(axis.node, "rw", timeout=5.0)
+            try:
+                restore(station, node, axis)
+                run(station, node, axis)
+                wait_moving(station, node.read, axis)
+                begin()
+                began = time.monotonic()
+                with contextlib.suppress(OSError):
+                    stop_by(station, node, way)
+                time.sleep(SILENT_S)
+                end()
+                check_stops(station, fast, f"{way}, {name}")
+                texts.append(1e3 * (time.monotonic() - began))
+                check_back(station)
+                check_still(station, fast, WATCH_S / 2, f"{way}, {name}")
+                wait_for(lambda: not seen.read().in_motion[0], 2.0)
+            finally:
+                end()
+                with contextlib.suppress(OSError):
+                    node.close()
+                station.cell.reset()
     return f"{len(texts)} stops, the slowest at rest after {max(texts):.0f} ms, {1e3 * SILENT_S:.0f} of them hindered"
 
 
-def _hindrances(station: Station) -> list[tuple[str, Callable[[], Any], Callable[[], Any]]]:
-    """Return what can hinder a stop: name, begin, end."""
-    found: list[tuple[str, Callable[[], Any], Callable[[], Any]]] = []
+Hindrance = tuple[str, Callable[[], Any], Callable[[], Any]]
+"""Of a stop: its name, begin, end."""
+
+
+def _tried(hindrances: Sequence[Hindrance], ways: Sequence[str], full: bool) -> list[tuple[Hindrance, str]]:
+    """Return what is tried together: in full all pairs, else every hindrance and every way at least once.
+
+    The ways are the kit's, and lead to one stop; what hinders it is for the driver to get over.
+    """
+    if full:
+        return list(itertools.product(hindrances, ways))
+    count = max(len(hindrances), len(ways))
+    return list(itertools.islice(zip(itertools.cycle(hindrances), itertools.cycle(ways), strict=False), count))
+
+
+def _hindrances(station: Station) -> list[Hindrance]:
+    """Return what can hinder a stop."""
+    found: list[Hindrance] = []
     if station.wires:
         found.append(("its request lost", lambda: station.fault(deaf=1.0), station.fault))
         found.append(("its reply lost", lambda: station.fault(lose=1.0), station.fault))
@@ -83,28 +98,26 @@ def lost_outputs(station: Station, full: bool) -> str:
     if not outputs:
         raise NotApplicable("the device has no outputs with a safe value")
     output, count = outputs[0], 0
-    hindrances = _hindrances(station)
-    for name, begin, end in hindrances:
-        for way in ("emergency stop", "close"):
-            with station.cell.open(f"{output.node}.readonly") as seen:
-                node = station.cell.open(output.node, "rw", timeout=5.0)
-                try:
-                    set_all(node, output)
-                    wait_for(lambda: output.shown(seen, output.another), 3.0)
-                    begin()
-                    time.sleep(0.1)
-                    with contextlib.suppress(OSError):
-                        stop_by(station, node, way)
-                    time.sleep(LONG_SILENCE_S)
-                    end()
-                    check_back(station)
-                    check_safe(station, output, seen, f"{way}, {name} for {LONG_SILENCE_S:g} s")
-                    count += 1
-                finally:
-                    end()
-                    with contextlib.suppress(OSError):
-                        node.close()
-                    station.cell.reset()
+    for (name, begin, end), way in _tried(_hindrances(station), ("emergency stop", "close"), full):
+        with station.cell.open(f"{output.node}.readonly") as seen:
+            node = station.cell.open(output.node, "rw", timeout=5.0)
+            try:
+                set_all(node, output)
+                wait_for(lambda: output.shown(seen, output.another), 3.0)
+                begin()
+                time.sleep(0.1)
+                with contextlib.suppress(OSError):
+                    stop_by(station, node, way)
+                time.sleep(LONG_SILENCE_S)
+                end()
+                check_back(station)
+                check_safe(station, output, seen, f"{way}, {name} for {LONG_SILENCE_S:g} s")
+                count += 1
+            finally:
+                end()
+                with contextlib.suppress(OSError):
+                    node.close()
+                station.cell.reset()
     return f"safe after {count} hindered stops"
 
 

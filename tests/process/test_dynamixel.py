@@ -98,58 +98,6 @@ def test_modes_stops_and_shutdown(start: Callable[..., Any], short_folder: Path)
     assert not wire.reads("arm0.gone")
 
 
-def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("arm0.a")
-    wire.wait_up("arm0.b")
-
-    def lost(node: Any) -> bool:
-        try:
-            return bool(node.read().status[0] & AxisStatus.POSITION_LOST)
-        except OSError:
-            return False
-
-    with cell.open("arm0.b", "rw") as b:
-        b.command(velocity=6.0)
-        wait_for(lambda: wire.state("velocity", 2) < -3500, "motion")
-        wire.tell("stray 3")
-        b.stop_all()
-        wait_for(lambda: wire.state("torque", 2) == 0, "the torque off", 1.0)
-        wait_for(lambda: wire.state("velocity", 2) == 0, "rest", 2.0)
-        b.reset()
-        # a restart within the lost-link time, at the highest velocity
-        b.command(velocity=6.0)
-        wait_for(lambda: wire.state("velocity", 2) < -3500, "motion")
-        wire.tell("power_cycle 0.02")
-        wait_for(lambda: lost(b), "the lost place", 3.0)
-        wire.wait_up("arm0.b")
-        wait_for(lambda: wire.state("watchdog", 2) == 50, "the watchdog", 1.0)
-        assert wire.state("torque", 2) == 0
-        b.calibrate(0.0)
-        b.reset()
-        wait_for(lambda: wire.state("velocity", 2) == 0, "rest", 2.0)
-    with cell.open("arm0.a", "rw") as a:
-        a.reset()
-        a.move(7.0)  # beyond one turn
-        a.wait_until_idle(15.0)
-        wire.tell("power_cycle 0.3")
-        wait_for(lambda: lost(a), "the lost place", 5.0)
-        wire.wait_up("arm0.a")
-        a.reset()
-        with raises(1, "position lost"):
-            a.move(0.5)
-        a.calibrate(0.0)
-        a.reset()
-        a.move(0.5)
-        a.wait_until_idle(15.0)
-        # another master changes mode and runs it
-        wire.tell("foreign velocity 1500 1")
-        wire.daemon.wait_line("it restarted, or somebody else has written to it")
-        wait_for(lambda: wire.state("velocity", 1) == 0, "rest", 2.0)
-        wait_for(lambda: wire.state("mode", 1) == 4, "the mode", 3.0)
-
-
 def test_the_vendors_client_agrees_with_the_simulator(start: Callable[..., Any], short_folder: Path) -> None:
     sdk = pytest.importorskip("dynamixel_sdk")
     wire = Wire(start, short_folder, "dynamixel.simulator", "--ids", "1,2")

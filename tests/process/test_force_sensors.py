@@ -34,13 +34,6 @@ ATI = (
     '[device.f0]\ndriver = "ati-rdt"\nline = { udp = "{port}" }\npage = "{port}"\nfull_scale = [400, 400, 400, 20, 20, '
     "20]\n"
 )
-ADC = 'driver = "framed-adc"\nchannels = 4\nrate_hz = 200\nline = { serial = "{port}", baud = 921600 }\n'
-LINES = 'driver = "ascii-stream"\ncolumns = ["a", "b"]\nrate_hz = 200.0\ntime = "ms"\nline = { serial = "{port}" }\n'
-IIO = (
-    'driver = "iio"\ndevice = "iio_dummy_part_no"\nmode = "buffer"\ntrigger = "instance1"\nchannels = '
-    '["voltage0"]\nrate_hz = 200.0\n'
-    'sysfs = "{port}/sysfs"\ndev = "{port}/dev"\n'
-)
 SCHUNK = '[device.f0]\ndriver = "schunk-ft"\nline = { tcp = "{port}" }\ndata = "{port}"\n'
 
 
@@ -417,53 +410,6 @@ def test_schunk_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any
     wire.daemon.signal(signal.SIGTERM)
     assert wire.daemon.wait_exit(15) == 0
     assert not wire.tell("state")["streaming"]
-
-
-STOP = 'on_loss = "stop"\n'
-
-
-FROZEN = {
-    "schunk_ft": (("--port", "0", "--data-port", "0"), SCHUNK, "their number stands still at .*: the sensor is frozen"),
-    "ati_rdt": (("--port", "0"), ATI, "their number stands still at .*: the sensor is frozen"),
-    "ft300": (("--baud", "19200"), "[device.f0]\n" + FT300, "the last [0-9]+ records were all the same"),
-    "framed_adc": (
-        ("--channels", "4"), "[device.f0]\n" + ADC, "their number stands still at .*: the device is frozen",
-    ),
-    "ascii_stream": (
-        ("--rate", "200", "--time", "ms"), "[device.f0]\n" + LINES,
-        "their time stands still at .* ms: the device is frozen",
-    ),
-    "iio": ((), "[device.f0]\n" + IIO, "the time at which they were taken stands still"),
-}  # fmt: skip
-
-
-def test_frozen_streams_are_lost_links_and_stop_the_workcell(start: Callable[..., Any], short_folder: Path) -> None:
-    """Every 8th identical record was taken for a restart: no EIO in 5 s, and ``on_loss`` could not act."""
-    sensors, text = {}, ""
-    for name, (options, table, _) in FROZEN.items():
-        (short_folder / name).mkdir()
-        sensors[name] = Sensor(start, short_folder / name, f"{name}.simulator", *options)
-        text += table.replace("[device.f0]", f"[device.{name}]").replace("{port}", sensors[name].port) + STOP
-    cell = sensors["iio"].serve(text)
-    rig = sensors["iio"]
-    for name in FROZEN:
-        rig.wait_up(name)
-        with cell.open(name) as node:
-            node.wait_new(node.read().number + 20, 5.0)
-    for sensor in sensors.values():
-        sensor.tell("freeze")
-    for name, (_, _, words) in FROZEN.items():
-        wait_for(lambda name=name: not rig.reads(name), f"EIO from {name}", 5.0)
-        wait_for(lambda name=name, words=words: re.search(words, rig.reason(name)), f"{words} in {rig.reason(name)}")
-    wait_for(lambda: cell.status()["stop_source"], "the workcell stopped by a loss", 5.0)
-    seen, until = [], time.monotonic() + 1.5
-    while time.monotonic() < until:
-        seen += [name for name in FROZEN if rig.reads(name)]
-        time.sleep(0.02)
-    assert not seen, f"readable while they stood still: {seen}"
-    for name, sensor in sensors.items():
-        sensor.tell("freeze 0")
-        rig.wait_up(name)
 
 
 def test_schunk_connection_lost_and_box_restarted(start: Callable[..., Any], short_folder: Path) -> None:

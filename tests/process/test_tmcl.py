@@ -91,64 +91,6 @@ def test_moves_homes_and_faults(start: Callable[..., Any], short_folder: Path) -
         assert wire.tell("store") == [68]
 
 
-def counted(node: Any, counter: str, before: int) -> bool:
-    return bool(node.statistics()["link"][counter] > before)
-
-
-def test_stray_bytes_restarts_and_other_masters(start: Callable[..., Any], short_folder: Path) -> None:
-    wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2", "--baud", "115200")
-    cell = wire.serve(CONFIG)
-    wire.wait_up("mod0.x")
-    with cell.open("mod0.x", "rw") as x:
-        # one stray byte, and no telegram is cut where it begins: the stop gets through all the same
-        for stray in (1, 5, 8):
-            x.command(velocity=0.1)
-            wait_for(lambda: wire.state("velocity") > 0.09 * PER_M, "motion")
-            wire.tell(f"stray {stray}")
-            x.stop_all()
-            wait_for(lambda: wire.state("velocity") == 0, "rest", 1.0)
-            wait_for(lambda: wire.reads("mod0.x"), "the axis")
-            x.reset()
-            at_rest(x)
-        # a restart within the lost-link time, at the highest velocity
-        x.command(velocity=0.1)
-        wait_for(lambda: wire.state("velocity") > 0.09 * PER_M, "motion")
-        wire.tell("power_cycle 0.02")
-        wire.daemon.wait_line("it restarted, or somebody else has set it")
-        wait_for(lambda: lost(x), "the lost place", 3.0)
-        wait_for(lambda: wire.state("heartbeat_ms") == 200, "the heartbeat", 1.0)
-        wait_for(lambda: wire.state("speed") == 0.1 * PER_M, "the limit", 1.0)
-        wire.wait_up("mod0.x")
-        x.reset()
-        with raises(1, "position lost"):
-            x.move(0.01)
-        at_rest(x)
-        x.calibrate(0.0)
-        x.reset()
-        x.move(0.01)
-        x.wait_until_idle(5.0)
-        assert wire.state("velocity") == 0
-        # somebody else runs the motor
-        wire.tell(f"foreign velocity {0.05 * PER_M}")
-        wait_for(lambda: x.read().status[0] & AxisStatus.FAULT, "the fault", 3.0)
-        wait_for(lambda: wire.state("velocity") == 0, "rest", 1.0)
-        # a refused stop is sent again
-        x.reset()
-        x.command(velocity=0.1)
-        wait_for(lambda: wire.state("velocity") > 0.09 * PER_M, "motion")
-        wire.tell("refuse 3")
-        x.stop_all()
-        wait_for(lambda: wire.state("velocity") == 0, "rest", 2.0)
-
-
-def lost(axis: Any) -> bool:
-    """Tell whether an axis has lost its place; one whose link is lost tells nothing."""
-    try:
-        return bool(axis.read().status[0] & AxisStatus.POSITION_LOST)
-    except OSError:
-        return False
-
-
 def test_wrong_devices(start: Callable[..., Any], short_folder: Path) -> None:
     misfits = (
         Misfit("module 1276", ("--module", "1276")),

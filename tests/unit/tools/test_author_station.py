@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+from sioms.check.refusal_trials import _tried
 from sioms.check.station import Station, _crash
 
 LOG = r"""time=1 level=info event="device up" device=stage pid=7
@@ -49,3 +50,15 @@ def test_the_reason_of_a_fault_is_waited_for_as_it_is_logged_behind_what_the_axi
 def test_a_fault_of_before_the_last_calm_is_not_taken_for_this_one() -> None:
     assert station(FAULT, before=len(FAULT)).last_fault() == ""
     assert station(FAULT, "", FAULT.replace("85", "10"), before=len(FAULT)).last_fault() == "fault of x: alarm 0x10"
+
+
+def test_every_hindrance_and_every_way_of_stopping_is_tried() -> None:
+    nothing = ("request lost", "reply lost", "refused")
+    hindrances = [(name, lambda: None, lambda: None) for name in nothing]
+    ways = ("stop", "emergency stop", "close")
+    for count in (1, 2, 3):
+        pairs = [(hindrance[0], way) for hindrance, way in _tried(hindrances[:count], ways, False)]
+        assert {name for name, _ in pairs} == set(nothing[:count]) and {way for _, way in pairs} == set(ways)
+        assert len(set(pairs)) == 3
+        assert len(_tried(hindrances[:count], ways, True)) == 3 * count
+    assert len(_tried(hindrances, ways[:2], False)) == 3
