@@ -28,11 +28,18 @@ from sioms.tactile.finger import from_toml, nominal_finger, to_toml
 from sioms.tactile.live.simulated import simulated
 
 CONFIG = Path(__file__).parents[2] / "etc" / "prober.toml"
-ELEMENTS = 6  # a short finger: half a minute of touches
+ELEMENTS = 4
+"""Of a short finger: half a minute of touches."""
 ANGLES = np.radians(90.0 - 9.22 * np.arange(ELEMENTS))
 PUBLIC = f"gain = 3.0; length_m = 0.012; angles_rad = {ANGLES.tolist()}"
 HIDDEN = "gain_scatter = 0.12\nseed = 5\n"
-SHAPE = '\n[device.tactile0.shape]\nfinger_file = "finger.toml"\nload_node = "force0.fz"\nload_scale = 83.333\n'
+SHAPE = """
+[device.tactile0.shape]
+finger_file = "finger.toml"
+load_node = "force0.fz"
+load_scale = 83.333
+compiled = true
+"""
 MODEL = f"""[finger]
 name = "left"
 core_m = 0.0096
