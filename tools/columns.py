@@ -26,7 +26,9 @@ ORDER = (
     ("m", "wait_marker_number"),
     ("s", "signal_marker_number"),
 )
-_QUANTITIES = "pvajfF"
+QUANTITIES = "pvajfF"
+MOST_WHOLE = 1 << 53
+"""The greatest whole number that may be given, either sign: all up to it are numbers of floating point, too."""
 _COLUMNS = WRITE[NodeClass.AXIS]
 
 
@@ -60,7 +62,7 @@ class Columns:
         self.is_axis = info.node_class is NodeClass.AXIS
         letters = [letter for letter, _ in ORDER if letter in flags]
         if self.is_axis:
-            if not any(letter in _QUANTITIES for letter in letters):
+            if not any(letter in QUANTITIES for letter in letters):
                 letters.insert(0, "p")
             self._names = [name for letter, name in ORDER if letter in letters]
             for name in self._names:
@@ -110,6 +112,6 @@ class Columns:
 
 
 def _whole(value: float, what: str) -> int:
-    if value != int(value) or not -(1 << 53) <= value <= 1 << 53:
+    if value != int(value) or not -MOST_WHOLE <= value <= MOST_WHOLE:
         raise ValueError(f"{what} {value:g}; want an integer")
     return int(value)

@@ -1,4 +1,4 @@
-"""The shell tools: how soon devin has printed, and a loop that devin and devout close through a pipe."""
+"""The shell tools: how soon devin has printed and devout written, and a loop that both close through a pipe."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEP_S = 0.0517
 
 
 def bench_pipe(options: Options, report: Report) -> None:
-    """Start of devin; lateness of its rows at 1 kHz; a step through devin, pipe and devout."""
+    """Start of devin and devout; lateness of its rows at 1 kHz; a step through devin, pipe and devout."""
     tools = [Path(sys.executable).with_name(name) for name in ("devin", "devout")]
     missing = [str(tool) for tool in tools if not tool.exists()]
     if missing:
@@ -41,7 +41,7 @@ def bench_pipe(options: Options, report: Report) -> None:
     with Daemon(workcell(devices)) as daemon:
         environment = dict(os.environ, SIOMS_SOCKET=daemon.socket)
         devin, devout = (str(tool) for tool in tools)
-        _start(options, report, devin, environment)
+        _start(options, report, devin, devout, environment)
         _loop(options, report, devin, devout, environment, "")
         try:
             with _realtime():
@@ -51,13 +51,17 @@ def bench_pipe(options: Options, report: Report) -> None:
         _steps(options, report, devin, devout, environment, daemon)
 
 
-def _start(options: Options, report: Report, devin: str, environment: dict[str, str]) -> None:
-    bare, took = [], []
+def _start(options: Options, report: Report, devin: str, devout: str, environment: dict[str, str]) -> None:
+    lines = ([devin, "mod0"], [devout, "-W", "mod0.a0", "0"])
+    bare: list[int] = []
+    took: list[list[int]] = [[] for _ in lines]
     for _ in range(options.count(10, 200)):
         bare.append(interpreter_ns())
-        took.append(run_ns([devin, "mod0"], environment))
+        for line, times in zip(lines, took, strict=True):
+            times.append(run_ns(line, environment))
     base = report.samples("bare interpreter, start to exit", bare, "ms")
-    report.samples("devin mod0, start to exit", took, "ms", baseline=base, bars=[Bar("ratio", 0.6)])
+    for words, times in zip(("devin mod0", "devout -W mod0.a0 0"), took, strict=True):
+        report.samples(f"{words}, start to exit", times, "ms", baseline=base, bars=[Bar("ratio", 0.6)])
 
 
 @contextlib.contextmanager

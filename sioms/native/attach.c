@@ -19,13 +19,16 @@
 #include <time.h>
 #include <unistd.h>
 
-enum { MOST_DEPTH = 16, FIRST_WORD = 8, PATIENCE_US = 100000 };
+enum { MOST_DEPTH = 16, FIRST_WORD = 8, PATIENCE_US = 100000, MOST_NAME = 200 };
 
 static char **arguments;
+static void (*committed)(void); /* what to do instead, where it is too late to become another program */
 
 /* Become the tool in Python. Every descriptor of ours is closed by that. */
 static _Noreturn void leave_to_python(void)
 {
+    if (committed)
+        committed();
     execvp(arguments[1], arguments + 1);
     _exit(127);
 }
@@ -38,11 +41,12 @@ static void *take(size_t size)
     return memory;
 }
 
-/* Say one line, its blanks made single, and end. */
-static _Noreturn void fail(const char *text)
+/* Say one line, its blanks made single. */
+static void say(const char *text)
 {
-    char line[2048] = "devin:";
-    size_t n = 6;
+    static char line[8 * MAX_PACKET];
+    size_t n = sizeof TOOL;
+    memcpy(line, TOOL ":", n);
     for (const char *c = text; *c && n < sizeof line - 2; c++) {
         if (*c != ' ' && (c == text || c[-1] == ' '))
             line[n++] = ' ';
@@ -51,7 +55,12 @@ static _Noreturn void fail(const char *text)
     }
     line[n++] = '\n';
     if (write(2, line, n) < 0)
-        _exit(1);
+        return; /* nobody listens there; the status still tells */
+}
+
+static _Noreturn void fail(const char *text)
+{
+    say(text);
     _exit(1);
 }
 
@@ -213,12 +222,102 @@ static void pass(struct message *m, int depth)
 static void take_text(struct message *m, char *text, size_t room)
 {
     int kind = take_bytes(m, 1);
-    size_t length = kind >= 0xA0 && kind < 0xC0 ? (size_t)(kind & 31) : kind == 0xD9 ? take_bytes(m, 1) : room;
+    size_t length = kind >= 0xA0 && kind < 0xC0 ? (size_t)(kind & 31)
+                    : kind == 0xD9              ? take_bytes(m, 1)
+                    : kind == 0xDA              ? take_bytes(m, 2)
+                                                : room;
     if (length >= room || length > (size_t)(m->end - m->at))
         leave_to_python();
     memcpy(text, m->at, length);
     text[length] = 0;
     m->at += length;
+}
+
+/* ---- the command line ------------------------------------------------------------------------ */
+
+struct flags {
+    int given[128];
+    double value[128];
+};
+
+static int is_numeric(const char *word)
+{
+    word += *word == '+' || *word == '-';
+    word += *word == '.';
+    return *word >= '0' && *word <= '9';
+}
+
+static const char *number_end(const char *at)
+{
+    const char *end = at + (*at == '+' || *at == '-'), *start = end;
+    while ((*end >= '0' && *end <= '9') || *end == '.')
+        end++;
+    if (end > start && (*end == 'e' || *end == 'E')) {
+        const char *exponent = end + 1 + (end[1] == '+' || end[1] == '-');
+        if (*exponent >= '0' && *exponent <= '9')
+            for (end = exponent; *end >= '0' && *end <= '9'; end++)
+                ;
+    }
+    return end;
+}
+
+static void take_group(const char *at, struct flags *next, struct flags *all)
+{
+    if (!*at)
+        leave_to_python();
+    while (*at) {
+        const struct option *option = OPTIONS;
+        while (option->letter && option->letter != *at)
+            option++;
+        if (!option->letter)
+            leave_to_python();
+        double value = 0;
+        const char *end = ++at;
+        if (option->valued) {
+            char *parsed;
+            end = number_end(at);
+            value = strtod(at, &parsed);
+            if (end == at || parsed != end || !(value >= option->low && value <= option->high)
+                || (option->whole && value != floor(value)))
+                leave_to_python();
+        }
+        at = end;
+        struct flags *owner = option->for_all ? all : next;
+        owner->given[(int)option->letter] = 1;
+        owner->value[(int)option->letter] = value;
+    }
+}
+
+/* Whether a word can be nothing but the name of a node: no path, and no link that may lead to one. */
+static int is_plain_name(const char *word)
+{
+    struct stat found;
+    if (!*word || *word == '-' || is_numeric(word) || strlen(word) >= MOST_NAME)
+        return 0;
+    for (const char *c = word; *c; c++)
+        if (*c == '/' || *c <= ' ' || *c > '~')
+            return 0;
+    return lstat(word, &found) || !S_ISLNK(found.st_mode);
+}
+
+/* The structures that -l, -h and -n choose. */
+static void choose_channels(const struct flags *flags, int64_t count, int64_t *low, int64_t *high)
+{
+    const int *given = flags->given;
+    if (given['n'] && (given['l'] || given['h']))
+        leave_to_python();
+    *low = given['n'] ? flags->value['n'] : given['l'] ? flags->value['l'] : 0;
+    *high = given['n'] ? flags->value['n'] : given['h'] ? flags->value['h'] : count - 1;
+    if (*low < 0 || *low > *high || *high >= count)
+        leave_to_python();
+}
+
+/* See to it that no socket becomes standard input or output where the caller has closed them. */
+static void occupy_standard_descriptors(void)
+{
+    for (int fd = 0; fd < 3; fd++)
+        if (fcntl(fd, F_GETFD) < 0 && open("/dev/null", fd ? fd == 1 ? O_RDONLY : O_RDWR : O_WRONLY) < 0)
+            leave_to_python();
 }
 
 /* ---- the daemon ------------------------------------------------------------------------------- */
@@ -302,4 +401,18 @@ static int ask(int sock, const void *packet, size_t size, int64_t number, struct
     if (parts > 4 && (rest.at >= rest.end || *rest.at != 0xC2)) /* compressed: of thousands of channels */
         leave_to_python();
     return refused;
+}
+
+static int ask_open(int sock, const char *name, struct message *m, int *fds, int *fd_count)
+{
+    static int64_t number = OPEN_NUMBER;
+    uint8_t packet[sizeof OPEN_HEAD + sizeof OPEN_TAIL + MOST_NAME + 16];
+    size_t n = sizeof OPEN_HEAD, length = strlen(name);
+    memcpy(packet, OPEN_HEAD, n);
+    packet[n++] = 0xD9;
+    packet[n++] = length;
+    memcpy(packet + n, name, length);
+    n += length;
+    memcpy(packet + n, OPEN_TAIL, sizeof OPEN_TAIL);
+    return ask(sock, packet, n + sizeof OPEN_TAIL, number, m, fds, fd_count);
 }

@@ -1,4 +1,4 @@
-"""Makes the library of the compiled steps, and the compiled ``devin`` beside it:
+"""Makes the library of the compiled steps, and the compiled ``devin`` and ``devout`` beside it:
 ``python -m sioms.native.build [-o FOLDER] [COMPILER...]``.
 
 A compiler is any command that takes the options of cc: ``cc``, or ``python -m ziglang cc`` of the package ziglang,
@@ -23,11 +23,11 @@ OPTIONS = (
     "-Werror=implicit-function-declaration",
 )  # fmt: skip
 """A function without a declaration is refused by some compilers and taken for another by others."""
-DEVIN, DEVIN_SOURCE = "_devin", "sioms.tools.compiled"
+TOOLS, TOOLS_SOURCE = ("devin", "devout"), "sioms.tools.compiled"
 
 
 def build(folder: Path, compiler: list[str]) -> None:
-    """Make both.
+    """Make all.
 
     Args:
         folder: where to; each appears whole or not at all.
@@ -36,23 +36,26 @@ def build(folder: Path, compiler: list[str]) -> None:
     Raises:
         OSError, subprocess.CalledProcessError: the compiler is not there, or refuses.
     """
-    devin: str = importlib.import_module(DEVIN_SOURCE).source()  # it stands above: it knows the tool's options
-    for target, text, shared in (
+    source = importlib.import_module(TOOLS_SOURCE).source  # it stands above: it knows the options of the tools
+    made: list[tuple[Path, str, tuple[str, ...]]] = [
         (folder / language.LIBRARY.name, translate(language.MODULES), ("-fPIC", "-shared")),
-        (folder / DEVIN, devin, ()),
-    ):
+        *((folder / f"_{tool}", source(tool), ()) for tool in TOOLS),
+    ]
+    for target, text, shared in made:
         with tempfile.TemporaryDirectory() as place:
-            source, made = Path(place) / "source.c", Path(place) / "made"
-            source.write_text(text)
-            subprocess.run([*compiler, *OPTIONS, *shared, str(source), "-o", str(made), "-lm"], check=True)
+            code, program = Path(place) / "source.c", Path(place) / "made"
+            code.write_text(text)
+            subprocess.run([*compiler, *OPTIONS, *shared, str(code), "-o", str(program), "-lm"], check=True)
             fresh = target.with_name(f"{target.name}.{os.getpid()}")
-            fresh.write_bytes(made.read_bytes())
+            fresh.write_bytes(program.read_bytes())
             fresh.chmod(0o755)
             fresh.replace(target)
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="python -m sioms.native.build", description="compile the steps and devin")
+    parser = argparse.ArgumentParser(
+        prog="python -m sioms.native.build", description="compile the steps, devin and devout"
+    )
     parser.add_argument("-o", "--output", type=Path, default=language.LIBRARY.parent, metavar="FOLDER")
     parser.add_argument("--show", action="store_true", help="print the C of the steps instead")
     parser.add_argument("compiler", nargs="*", default=["cc"])

@@ -5,7 +5,7 @@
  * shares with that tool (layout of pages and records, messages, options, formats) is in what sioms.tools.compiled puts
  * before this text and attach.c when they are compiled. Why so: docs/decisions/0285-devin-without-an-interpreter.md.
  */
-enum { MOST_TARGETS = 32, MOST_NAME = 200 };
+enum { MOST_TARGETS = 32 };
 
 static int64_t now_ns(void)
 {
@@ -18,8 +18,7 @@ static int64_t now_ns(void)
 
 struct target {
     const char *name;
-    int given[128];
-    double value[128];
+    struct flags flags;
     char opened[MOST_NAME + 16], device[MOST_NAME];
     const uint8_t *page;
     uint8_t *raw;
@@ -29,80 +28,27 @@ struct target {
     const struct field *field[8];
 };
 
-static struct target targets[MOST_TARGETS + 1], all; /* after the last: flags that nothing follows; all: of the line */
+static struct target targets[MOST_TARGETS + 1]; /* after the last: flags that nothing follows */
+static struct flags all;                        /* of the line */
 static int target_count, timed;
-
-static int is_numeric(const char *word)
-{
-    word += *word == '+' || *word == '-';
-    word += *word == '.';
-    return *word >= '0' && *word <= '9';
-}
-
-static const char *number_end(const char *at)
-{
-    const char *end = at + (*at == '+' || *at == '-'), *start = end;
-    while ((*end >= '0' && *end <= '9') || *end == '.')
-        end++;
-    if (end > start && (*end == 'e' || *end == 'E')) {
-        const char *exponent = end + 1 + (end[1] == '+' || end[1] == '-');
-        if (*exponent >= '0' && *exponent <= '9')
-            for (end = exponent; *end >= '0' && *end <= '9'; end++)
-                ;
-    }
-    return end;
-}
-
-static void take_group(const char *at, struct target *next)
-{
-    if (!*at)
-        leave_to_python();
-    while (*at) {
-        const struct option *option = OPTIONS;
-        while (option->letter && option->letter != *at)
-            option++;
-        if (!option->letter)
-            leave_to_python();
-        double value = 0;
-        const char *end = ++at;
-        if (option->valued) {
-            char *parsed;
-            end = number_end(at);
-            value = strtod(at, &parsed);
-            if (end == at || parsed != end || !(value >= option->low && value <= option->high)
-                || (option->whole && value != floor(value)))
-                leave_to_python();
-        }
-        at = end;
-        struct target *owner = option->for_all ? &all : next;
-        owner->given[(int)option->letter] = 1;
-        owner->value[(int)option->letter] = value;
-    }
-}
 
 static void take_line(char **words)
 {
     for (; *words; words++) {
         const char *word = *words;
         struct target *next = &targets[target_count];
-        struct stat found;
         if (word[0] == '-' && word[1] != '-' && !is_numeric(word)) {
-            take_group(word + 1, next);
+            take_group(word + 1, &next->flags, &all);
             continue;
         }
-        if (!*word || *word == '-' || is_numeric(word) || strlen(word) >= MOST_NAME || target_count == MOST_TARGETS)
-            leave_to_python();
-        for (const char *c = word; *c; c++)
-            if (*c == '/' || *c <= ' ' || *c > '~')
-                leave_to_python();
-        if (!lstat(word, &found) && S_ISLNK(found.st_mode))
+        if (target_count == MOST_TARGETS || !is_plain_name(word))
             leave_to_python();
         next->name = word;
         target_count++;
     }
     timed = all.given['r'] || all.given['t'] || all.given['L'];
     for (int letter = 0; letter < 128; letter++)
-        if (targets[target_count].given[letter] && !(letter == 'N' && timed))
+        if (targets[target_count].flags.given[letter] && !(letter == 'N' && timed))
             leave_to_python();
     if (!target_count)
         leave_to_python();
@@ -111,17 +57,12 @@ static void take_line(char **words)
 /* Choose structures and columns; whoever names one that there is not hears of it from the tool in Python. */
 static void choose(struct target *t)
 {
-    const int *given = t->given;
+    const int *given = t->flags.given;
     const char *choice = timed ? "pvfm" : "pvfmN";
     int some = 0;
     if (given['V'] && !timed)
         leave_to_python();
-    if (given['n'] && (given['l'] || given['h']))
-        leave_to_python();
-    t->low = given['n'] ? t->value['n'] : given['l'] ? t->value['l'] : 0;
-    t->high = given['n'] ? t->value['n'] : given['h'] ? t->value['h'] : t->count - 1;
-    if (t->low < 0 || t->low > t->high || t->high >= t->count)
-        leave_to_python();
+    choose_channels(&t->flags, t->count, &t->low, &t->high);
     for (const char *c = choice; *c; c++)
         some |= given[(int)*c];
     t->lines = !timed && (!some || given['N']);
@@ -131,20 +72,6 @@ static void choose(struct target *t)
 }
 
 /* ---- opening ------------------------------------------------------------------------------------ */
-
-static int ask_open(int sock, const char *name, struct message *m, int *fds, int *fd_count)
-{
-    static int64_t number = OPEN_NUMBER;
-    uint8_t packet[sizeof OPEN_HEAD + sizeof OPEN_TAIL + MOST_NAME + 16];
-    size_t n = sizeof OPEN_HEAD, length = strlen(name);
-    memcpy(packet, OPEN_HEAD, n);
-    packet[n++] = 0xD9;
-    packet[n++] = length;
-    memcpy(packet + n, name, length);
-    n += length;
-    memcpy(packet + n, OPEN_TAIL, sizeof OPEN_TAIL);
-    return ask(sock, packet, n + sizeof OPEN_TAIL, number, m, fds, fd_count);
-}
 
 static void open_target(int sock, struct target *t)
 {
@@ -352,10 +279,8 @@ int main(int argc, char **argv)
     take_line(argv + FIRST_WORD);
     signal(SIGINT, SIG_DFL);
     signal(SIGPIPE, SIG_DFL);
-    prctl(PR_SET_NAME, "devin");
-    for (int fd = 0; fd < 3; fd++)
-        if (fcntl(fd, F_GETFD) < 0 && open("/dev/null", fd ? fd == 1 ? O_RDONLY : O_RDWR : O_WRONLY) < 0)
-            leave_to_python();
+    prctl(PR_SET_NAME, TOOL);
+    occupy_standard_descriptors();
     struct message m;
     int fds[8], fd_count, sock = connect_to_daemon(), numbered = 0;
     if (ask(sock, HELLO, sizeof HELLO, HELLO_NUMBER, &m, fds, &fd_count))
@@ -364,12 +289,12 @@ int main(int argc, char **argv)
     for (int i = 0; i < target_count; i++) {
         open_target(sock, &targets[i]);
         choose(&targets[i]);
-        numbered |= targets[i].given['N'];
+        numbered |= targets[i].flags.given['N'];
         room += (targets[i].high - targets[i].low + 1) * (targets[i].fields + 1) * 32;
     }
     char *text = take(room), *at = text;
     if (timed) {
-        repeat(text, numbered || targets[target_count].given['N']);
+        repeat(text, numbered || targets[target_count].flags.given['N']);
         return 0;
     }
     for (int i = 0; i < target_count; i++)
