@@ -21,3 +21,13 @@ def receive(sock: socket.socket, most_bytes: int, most_fds: int) -> tuple[bytes,
         if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
             fds.frombytes(data[: len(data) - len(data) % fds.itemsize])
     return packet, list(fds)
+
+
+def has_ended(sock: socket.socket) -> bool:
+    """Tell whether the other end of a socket has gone, and nothing that it has sent is left to take."""
+    try:
+        return not sock.recv(1, socket.MSG_PEEK | socket.MSG_DONTWAIT)
+    except BlockingIOError:
+        return False
+    except OSError:
+        return True

@@ -247,6 +247,7 @@ class Bank(ABC):
     def stop(self, axes: AxesLike, now_ns: int) -> None:
         """Empty the buffers and stop at maximum deceleration; force mode goes over to holding."""
         chosen = self._forget(axes)
+        self._braked[chosen] = False
         self._halt(chosen, self._catch_up(now_ns), fastest=False)
 
     def emergency_stop(self, axes: AxesLike, now_ns: int) -> None:

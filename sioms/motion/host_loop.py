@@ -324,7 +324,7 @@ class AxisBank(Bank):
     def after_quiet(self) -> None:
         """Go on behind quiet ticks, if there were any, and behind a stop that steps have begun.
 
-        The ``emergency_stop`` of all axes follows at once.
+        The ``emergency_stop`` of all axes, or their ``stop``, follows at once.
         """
         if self._last_ns != self.loop.last_ns:
             self._last_ns = self.loop.last_ns

@@ -68,8 +68,8 @@ def is_behind(a: Loop, i: int) -> int:
 
 
 @step
-def stop_axes(s: Stopping, now_ns: int) -> int:
-    """Begin to stop all axes at now. Returns 1, and nothing is done, where that is for the bank."""
+def stop_axes(s: Stopping, now_ns: int, latches: int) -> int:
+    """Begin to stop all axes at now, latched or not. Returns 1, and nothing is done, where that is for the bank."""
     a = s.loop
     if now_ns >= a.next_ns:
         return 1
@@ -79,17 +79,18 @@ def stop_axes(s: Stopping, now_ns: int) -> int:
     for i in range(a.n):
         s.fresh[i] = not a.latched[i] & AxisStatus.EMERGENCY_STOP
         if s.fresh[i]:
-            latch(s, i, now_ns)
+            stop_axis(s, i, now_ns, latches)
     s.braked_ns = now_ns
     return 0
 
 
 @step
-def latch(s: Stopping, i: int, now_ns: int) -> int:
-    """Latch the stop of an axis, and let it brake if it moves."""
+def stop_axis(s: Stopping, i: int, now_ns: int, latches: int) -> int:
+    """Let an axis brake if it moves; latch its stop or not."""
     a = s.loop
-    a.latched[i] = a.latched[i] | AxisStatus.EMERGENCY_STOP
-    a.event_status[i] = a.event_status[i] | AxisStatus.EMERGENCY_STOP
+    if latches:
+        a.latched[i] = a.latched[i] | AxisStatus.EMERGENCY_STOP
+        a.event_status[i] = a.event_status[i] | AxisStatus.EMERGENCY_STOP
     if a.kind[i] != HOLD and a.kind[i] != STOP:
         brake(s, i, now_ns)
         a.event_status[i] = a.event_status[i] | AxisStatus.MOVING | AxisStatus.STOPPING

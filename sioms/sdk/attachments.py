@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from sioms.descriptors import has_ended
 from sioms.protocol import verbs
 from sioms.protocol.compiled import add_decoders
 from sioms.protocol.driver_verbs import Attach, Detached
@@ -25,7 +26,7 @@ from sioms.protocol.text import shown
 from sioms.protocol.verbs import Message
 from sioms.turns import Turns
 
-from .blocks import AnyBlock
+from .blocks import AnyBlock, AxisBlock
 from .exchange import HookError
 from .handles import LATER, Handle, Quota
 from .parts import Service
@@ -57,6 +58,8 @@ class Attachments:
         self.handles = handles
         self._service, self._turns, self._tell, self._journal = service, turns, tell, journal
         self._leased: list[Handle] = []
+        self._owners: dict[int, Handle] = {}
+        """Who owns outputs, by the descriptors that tell of his end."""
         self.writers: list[Handle] = []
         """Handles that may write."""
 
@@ -92,6 +95,17 @@ class Attachments:
         if parts:
             self._service.stops.safe_stop(Reason(Stop.CONTROLLED, "its owner has gone"), [*parts.values()])
 
+    def gone(self, fd: int) -> Handle | None:
+        """Return the owner of whom a descriptor that is ready says that he has gone, if all axes of the device are his
+        and have not been halted; else None.
+        """
+        handle = self._owners.get(fd)
+        if handle is None or handle.halted or len(handle.axes) != handle.block.n:
+            return None
+        if [block for block in self._service.blocks if isinstance(block, AxisBlock)] != [handle.block]:
+            return None
+        return handle if fd == handle.pidfd or has_ended(handle.sock) else None
+
     def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
         """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed
         again.
@@ -121,6 +135,8 @@ class Attachments:
             time.monotonic_ns(), self._service.effects, Quota(*quota),
         )  # fmt: skip
         self.handles[number] = handle
+        if exclusive:
+            self._owners |= dict.fromkeys((sock.fileno(), *([handle.pidfd] if handle.pidfd >= 0 else [])), handle)
         if lease_ns:
             self._leased.append(handle)
         if handle.writes:
@@ -277,6 +293,8 @@ class Attachments:
         self._turns.remove(handle.sock.fileno())
         if handle.pidfd >= 0:
             self._service.loop.unwatch(handle.pidfd)
+        for fd in (handle.sock.fileno(), handle.pidfd):
+            self._owners.pop(fd, None)
         if handle in self._leased:
             self._leased.remove(handle)
         if handle.writes:

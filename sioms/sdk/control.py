@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from typing import TypeAlias
 
-from sioms.descriptors import receive
+from sioms.descriptors import has_ended, receive
 from sioms.protocol import driver_verbs
 from sioms.protocol.messages import MAX_PACKET, MAX_UNPACKED
 from sioms.protocol.verbs import Message, take
@@ -41,6 +41,11 @@ class Control:
     def is_behind(self) -> bool:
         """Whether there are messages to take that orders have overtaken: the descriptor tells nothing of them."""
         return bool(self._kept)
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the daemon has gone, and nothing that it has sent is left to take."""
+        return not self._kept and has_ended(self._sock)
 
     def tell(self, message: Message) -> None:
         """Send the daemon a message."""

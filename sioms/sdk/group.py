@@ -16,7 +16,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from sioms.protocol.verbs import take
 
 from .finding import find_driver, read_settings
 from .quiet import QuietRun
-from .quiet_step import Many, begin_stop, heed_one, run_many, wait_turn
+from .quiet_step import Many, begin_halt, begin_stop, heed_one, run_many, wait_turn
 from .rt import ChangeWatch, name_process, settle
 from .runtime import Runtime
 
@@ -57,6 +57,7 @@ class Member:
         priority, user: of the process, by what its configuration says.
         quiet: by whom it ticks while it waits; None: by its loop.
         owes: whether it has to look for a stop that somebody has asked for.
+        losses: what it has to do first: its owner or the daemon has gone, see ``Runtime.losses``.
     """
 
     runtime: Runtime
@@ -65,6 +66,7 @@ class Member:
     user: str
     quiet: QuietRun | None = None
     owes: bool = False
+    losses: list[Callable[[], None]] = field(default_factory=list)
 
 
 class Group:
@@ -123,11 +125,19 @@ class Group:
     def _put(self, fd: int) -> None:
         """Have a member served soon; until then it ticks on, unless the tick itself is what there is to be served."""
         quiet = self._members[fd].quiet
+        if quiet is not None and not self._may_go_on(self._members[fd], quiet):
+            self._rank(fd, STOPS)
         if quiet is None or wait_turn(quiet.record):
             self._of[fd] = 0
             self._rank(fd, STANDS)
         else:
             self._rank(fd, CALLED if quiet.record.called else CAN_WAIT)
+
+    def _may_go_on(self, member: Member, quiet: QuietRun) -> bool:
+        """Have a member halt by steps whose owner, or the daemon, has gone; return False where its loop has to."""
+        if not member.losses:
+            member.losses = member.runtime.losses(quiet.ready)
+        return not member.losses or not begin_halt(quiet.record, time.monotonic_ns())
 
     def _rank(self, fd: int, rank: int) -> None:
         """Let a member wait with others of its rank, behind those that have come before, if not with better ones."""
@@ -213,6 +223,11 @@ class Group:
         owes, member.owes = member.owes, False
         if owes:
             self._guarded(member, runtime.heed_requests)
+        losses, member.losses = member.losses, []
+        for lose in losses:
+            self._guarded(member, lose)
+        if losses:  # whose descriptors are ready no more
+            ready = [each for each in ready if each in runtime.timers]
         known = [*ready, *runtime.timers] if ticked else ready  # steps go on with the timers
         self._guarded(member, lambda: runtime.serve(ready + runtime.ready_but(known)))
         self._go_on(fd, member)

@@ -104,6 +104,12 @@ class QuietRun:
         """Wait for events, and tick meanwhile; between ``lend`` and ``take_back``."""
         run(self.record)
 
+    @property
+    def ready(self) -> list[int]:
+        """Descriptors that are ready for the loop."""
+        found: list[int] = self._ready[: self.record.waiting].tolist()
+        return found
+
     def take_back(self) -> list[int]:
         """Go on from where the steps have come; return the descriptors that are ready."""
         record, statistics = self.record, self._statistics
@@ -112,8 +118,7 @@ class QuietRun:
         self._idling.restless_ns = record.restless_ns
         self._pages.take_back()
         self._steps.resume()
-        ready: list[int] = self._ready[: record.waiting].tolist()
-        return ready
+        return self.ready
 
 
 def quiet_run(

@@ -76,8 +76,8 @@ class Quiet(Record):
     ``desk`` serves writes.
 
     ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: the loop has yet to
-    see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: it is a stop
-    that steps have begun. ``patient``: the device waits for its turn in a process of several, and ticks on meanwhile.
+    see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: steps have
+    begun a stop, or a halt. ``patient``: the device waits for its turn in a process of several, and ticks on meanwhile.
 
     ``control``: descriptor of the daemon's socket. ``called``: it is among those that are ready. ``spare``: as many
     numbers as ``ready``.
@@ -197,9 +197,25 @@ def begin_stop(q: Quiet, now_ns: int) -> int:
     """Begin to stop as the latch wants it, with a tick soon. Returns 1, and nothing is done, where the loop has to."""
     if not q.latch[STOPPED] or q.latch[STOPPED] == q.stopped or q.latch[RESETS] != q.resets:
         return 1
-    if q.stop(q.device, now_ns, 0, 0):
+    if begin_to_brake(q, now_ns, 1):
         return 1
     q.stopped = q.latch[STOPPED]
+    return 0
+
+
+@step
+def begin_halt(q: Quiet, now_ns: int) -> int:
+    """Begin to halt all axes, whose owner has gone, with a tick soon. Returns 1, and nothing is done, where the loop
+    has to.
+    """
+    return 0 if q.brakes else begin_to_brake(q, now_ns, 0)
+
+
+@step
+def begin_to_brake(q: Quiet, now_ns: int, latches: int) -> int:
+    """Have the device begin to stop, with a tick soon; return whether it has refused."""
+    if q.stop(q.device, now_ns, latches, 0):
+        return 1
     q.brakes = 1
     owe(q)
     if q.lead_ns and q.periods == 1 and not q.announced:

@@ -317,6 +317,18 @@ class Runtime:
         if self._control.is_behind:
             self._control_readable()
 
+    def losses(self, ready: Iterable[int]) -> list[Callable[[], None]]:
+        """Return what is to be done first about descriptors that tell of the end of the daemon, or of the owner of all
+        axes: each of it stops them.
+        """
+        found: list[Callable[[], None]] = []
+        for fd in ready:
+            if fd == self._control.fileno() and self._control.has_ended:
+                found.append(self._control_readable)
+            elif (handle := self.clients.gone(fd)) is not None:
+                found.append(partial(self.clients.drop, handle))
+        return found
+
     @property
     def pause_s(self) -> float | None:
         """How long the process may wait at most before ``serve`` has to be called again [s]; None for ever."""

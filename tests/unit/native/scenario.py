@@ -80,7 +80,7 @@ def main():
         if tick < 3000 and tick % 50 == 24:
             for bank in banks:
                 bank.plan_ahead()
-                if bank.is_quiet() and stop_axes(bank.stopping, now + 300_000) == 0:
+                if bank.is_quiet() and stop_axes(bank.stopping, now + 300_000, 1) == 0:
                     rest_stopped(bank.stopping, now + 600_000)
                     bank.after_quiet()
                     braked += 1

@@ -17,6 +17,7 @@ class Runtime:
         self.poll_fd, self._fails_in = os.eventfd(1, os.EFD_NONBLOCK), fails_in
         self.running, self.pause_s, self.did = True, None, []
         self.record, self.timers = SimpleNamespace(address=0, left=0, stopped=0, called=0), ()
+        self.ready, self.lost = [], []
 
     def _do(self, what):
         self.did.append(what)
@@ -29,6 +30,9 @@ class Runtime:
     def lend(self):
         self._do("lend")
         return self
+
+    def losses(self, ready):
+        return self.lost
 
     def take_back(self, quiet):
         self._do("take back")
@@ -55,6 +59,7 @@ class Runtime:
 def group(monkeypatch):
     monkeypatch.setattr(Group, "_settle", lambda self, member: None)
     monkeypatch.setattr("sioms.sdk.group.begin_stop", lambda record, now_ns: 1)
+    monkeypatch.setattr("sioms.sdk.group.begin_halt", lambda record, now_ns: record.stopped)
     monkeypatch.setattr("sioms.sdk.group.wait_turn", lambda record: record.left)
     ours, theirs = socket.socketpair()
     with ours, theirs:
@@ -147,3 +152,18 @@ def test_who_is_stopped_already_does_not_go_first_when_somebody_stops(group):
         [moving.runtime.poll_fd], [standing.runtime.poll_fd], [], [stopped.runtime.poll_fd],
     ]  # fmt: skip
     assert first.runtime.did[-3:-1] == ["heed requests", "serve"]
+
+
+def test_whose_owner_has_gone_halts_by_steps_or_goes_first_and_is_ended_before_anything_else(group):
+    patient, halts, refuses = members = start(group, "", "", "")
+    for member in (halts, refuses):
+        member.runtime.lost = [lambda runtime=member.runtime: runtime.did.append("owner ended")]
+    put(group, members)
+    put(group, [refuses], stopped=1)
+    assert [*group._due[STOPS]] == [refuses.runtime.poll_fd]
+    assert [*group._due[CAN_WAIT]] == [member.runtime.poll_fd for member in (patient, halts)]
+    while any(group._due):
+        group._serve_next()
+    for member in (halts, refuses):
+        assert member.runtime.did == ["start", "lend", "take back", "owner ended", "serve", "lend"]
+    assert patient.runtime.did == ["start", "lend", "take back", "serve", "lend"] and not halts.losses

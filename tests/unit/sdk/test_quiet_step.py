@@ -28,6 +28,7 @@ from sioms.sdk.quiet_step import (
     Many,
     Page,
     Quiet,
+    begin_halt,
     begin_stop,
     heed,
     heed_one,
@@ -56,6 +57,7 @@ class Device:
 
     def __init__(self, lead_ns=0, **fields):
         self.ticks, self.slacks, self.answer, self.slackens, self.rests, self.stops = [], 0, 0, 0, 0, 1
+        self.latched = []
         self.timer, self.other, self.control = (os.eventfd(0, os.EFD_NONBLOCK) for _ in range(3))
         self.line = TimerFd()
         self.poll = select.epoll()
@@ -94,7 +96,8 @@ class Device:
     def _rest(self, *_):
         return self.rests
 
-    def _stop(self, *_):
+    def _stop(self, _device, _now_ns, latches, _):
+        self.latched.append(latches)
         return self.stops
 
     def close(self):
@@ -216,6 +219,18 @@ def test_a_stop_is_begun_by_steps_and_told_to_the_loop(make):
     device.quiet.expired = 1
     device.latch[STOPPED], device.latch[RESETS] = 0, 1
     assert one_tick(device.quiet) == LEFT, "but not behind a reset"
+
+
+def test_a_halt_is_begun_by_steps_and_latches_nothing(make):
+    device = make(began_ns=77)
+    assert begin_halt(device.quiet, time.monotonic_ns()) == 1, "the device has refused"
+    assert not device.quiet.heeded_ns and not device.quiet.brakes
+    device.stops = 0
+    assert begin_halt(device.quiet, time.monotonic_ns()) == 0
+    assert (device.quiet.heeded_ns, device.quiet.brakes, device.quiet.stopped) == (77, 1, 0)
+    assert begin_halt(device.quiet, time.monotonic_ns()) == 0 and device.latched == [0, 0], "once"
+    device.latch[STOPPED] = 5
+    assert one_tick(device.quiet) == HEARD and device.latched == [0, 0, 1], "a stop is one that is latched"
 
 
 def test_an_order_to_another_device_is_not_looked_at_by_the_loop(make):
