@@ -162,9 +162,11 @@ def make(start: Callable[..., Any], short_folder: Path) -> Iterator[Callable[...
     block.end()
 
 
-@pytest.mark.parametrize("cause", ["stop", "close"])
-@pytest.mark.parametrize("trouble", ["silent", "silent for long", "refused", "reply lost"])
-def test_a_safe_value_is_sent_until_the_device_has_it(make: Callable[..., Cell], cause: str, trouble: str) -> None:
+@pytest.mark.parametrize(
+    ("trouble", "cause"),
+    [("silent", "close"), ("silent for long", "stop"), ("refused", "close"), ("reply lost", "stop")],
+)
+def test_a_safe_value_is_sent_until_the_device_has_it(make: Callable[..., Cell], trouble: str, cause: str) -> None:
     cell = make()
     block = cell.block
     node = cell.client.open("io0", "rw")
