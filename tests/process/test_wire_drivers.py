@@ -67,6 +67,8 @@ class Cell:
         self.drives = self._simulator("modbus.simulated.leadshine", "--link", folder / "drives", "--units", "1")
         self.finger = self._simulator("framed_adc.simulator", "--link", folder / "finger")
         self.io = self._simulator("modbus.simulated.moxa", "--model", "E1212")
+        for process in (self.drives, self.finger):
+            process.wait_line("^ready ")
         config = folder / "wire.toml"
         port = self.io.wait_line(r"^ready (\S+)$").group(1)
         config.write_text(CONFIG.format(folder=folder, io=port))
@@ -77,9 +79,7 @@ class Cell:
         self.client = sioms.Workcell(self.socket)
 
     def _simulator(self, name: str, *options: object) -> Any:
-        process = self._start([sys.executable, "-m", f"sioms.drivers.{name}", *map(str, options)])
-        process.wait_line("^ready ")
-        return process
+        return self._start([sys.executable, "-m", f"sioms.drivers.{name}", *map(str, options)])
 
     def tell(self, process: Any, line: str) -> Any:
         """Send a command to a simulator and return its answer's value."""
