@@ -30,11 +30,11 @@ HISTORY = 256
 """Snapshots that a device keeps: some seconds, so that the last of all devices can be looked at after the first."""
 LOOK_BACK_NS = 3 * 1_000_000_000 // RATE_HZ
 LATE_S = 0.5
-START_S, STOP_MS, MOST_SHARE = 3.0, 15.0, 1.0
+START_S, STOP_MS, HALT_MS, MOST_SHARE = 3.0, 15.0, 20.0, 1.0
 
 
 def bench_light(options: Options, report: Report) -> None:
-    """Start, processor, memory, descriptors and stops of 100 light devices on one core."""
+    """Start, processor, memory, descriptors, stops and the death of the owner of 100 light devices on one core."""
     starts, bare = [], []
     config = workcell([_device(i) for i in range(DEVICES)])
     core = max(os.sched_getaffinity(0))
@@ -64,6 +64,37 @@ def bench_light(options: Options, report: Report) -> None:
         faults = [name for name, state in states.items() if state != "up"]
         report.value("devices in fault", len(faults) + _axes_in_fault(nodes), "", bars=[Bar("value", 0)],
                      notes=" ".join(faults))  # fmt: skip
+    _deaths(options, report, config, core)
+
+
+def _deaths(options: Options, report: Report, config: str, core: int) -> None:
+    """Kill a client that owns all devices while they move."""
+    halts, counted = [], Counted()
+    with Daemon(config, core) as daemon, daemon.cell() as cell, ExitStack() as stack:
+        nodes = [stack.enter_context(cell.open(f"light{i}.readonly")) for i in range(DEVICES)]
+        trials = options.kills(2, 50)
+        for trial in range(trials):
+            victim = daemon.fork(partial(_own, daemon))
+            for node in nodes:
+                wait_cruising(node)
+            time.sleep(3e-9 * LOOK_BACK_NS)
+            watches = [Watch(node) for node in nodes]
+            begin = daemon.kill(victim)
+            found = (partial(halting_ns, watch, begin, look_back_ns=LOOK_BACK_NS) for watch in watches)
+            halts.append(max(counted.look(one) for one in found) - begin)
+            daemon.reap(victim)
+            report.progress(f"light, owner killed: {trial} of {trials}")
+    report.samples(
+        f"owner SIGKILL to the last of its {DEVICES} devices halting", halts, "ms", bars=[Bar("max", HALT_MS)]
+    )
+    counted.tell(report, "halts")
+
+
+def _own(daemon: Daemon) -> None:
+    """Own all devices, set them going, and wait for the end."""
+    cell = daemon.cell("owner")
+    _go([cell.open(f"light{i}", "rw", 10.0) for i in range(DEVICES)])
+    time.sleep(600.0)
 
 
 def _device(number: int) -> str:

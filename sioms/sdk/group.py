@@ -89,6 +89,8 @@ class Group:
         self._pauses: dict[int, float] = {}
         """After how long members have to be served without an event."""
         self._turns = 0
+        self._loses = False
+        """Whether somebody has just gone, who may have had more than has been seen."""
         self._requests: ChangeWatch | None = None
         self._is_settled = False
         self._of = np.zeros(MOST_FILES, dtype=np.int64)
@@ -109,7 +111,11 @@ class Group:
                     self._heed_requests()
                 elif self._sock is not None and fd == self._sock.fileno():
                     self._take(self._sock)
-            self._serve_next()
+            if self._loses:  # a process that ends closes one socket after another, if it gets to
+                self._loses = False
+                time.sleep(PAUSE_S)
+            else:
+                self._serve_next()
 
     def _wait(self) -> list[int]:
         """Return the descriptors that are ready; those of members who have more to do are."""
@@ -137,6 +143,7 @@ class Group:
         """Have a member halt by steps whose owner, or the daemon, has gone; return False where its loop has to."""
         if not member.losses:
             member.losses = member.runtime.losses(quiet.ready)
+            self._loses |= bool(member.losses)
         return not member.losses or not begin_halt(quiet.record, time.monotonic_ns())
 
     def _rank(self, fd: int, rank: int) -> None:

@@ -159,6 +159,7 @@ def test_whose_owner_has_gone_halts_by_steps_or_goes_first_and_is_ended_before_a
     for member in (halts, refuses):
         member.runtime.lost = [lambda runtime=member.runtime: runtime.did.append("owner ended")]
     put(group, members)
+    assert group._loses, "others may go with them"
     put(group, [refuses], stopped=1)
     assert [*group._due[STOPS]] == [refuses.runtime.poll_fd]
     assert [*group._due[CAN_WAIT]] == [member.runtime.poll_fd for member in (patient, halts)]
