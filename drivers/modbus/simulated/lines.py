@@ -44,6 +44,14 @@ class Registers(Protocol):
         """Take registers or bits."""
 
 
+def bits_from_0(count: int) -> SimData:
+    """Return pymodbus's data of this many bits, a multiple of 16, at the addresses from 0.
+
+    As words: of a count, pymodbus checks a list as long as its square, which for 4000 bits takes 2 GB and seconds.
+    """
+    return SimData(0, values=[0] * (count // 16), datatype=DataType.BITS)
+
+
 def simulated(unit: int, device: Registers, ranges: Iterable[tuple[int, int]]) -> SimDevice:
     """Return pymodbus's device with holding registers in these (first, count) ranges, all others illegal."""
     data = [SimData(first, count=count, values=0, datatype=DataType.REGISTERS) for first, count in ranges]

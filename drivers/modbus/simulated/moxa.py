@@ -23,7 +23,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from sioms.simulation.control import number, serve
 from sioms.simulation.faults import Faults
 
-from .lines import TcpLine
+from .lines import TcpLine, bits_from_0
 
 # model -> discrete inputs, outputs, analog inputs, first register of the analog inputs
 MODELS = {
@@ -193,7 +193,7 @@ def simulated_block(block: Block) -> SimDevice:
             return None
         return ExcCodes.ILLEGAL_FUNCTION
 
-    coils = [SimData(0, count=WATCHDOG_ALARM + 16, values=0, datatype=DataType.BITS)]
+    coils = [bits_from_0(WATCHDOG_ALARM + 16)]
     inputs = [SimData(0, count=2, values=0, datatype=DataType.BITS)]
     holding = [SimData(0x20, count=1, values=0, datatype=DataType.REGISTERS)]
     registers = [SimData(0, count=5040, values=0, datatype=DataType.REGISTERS)]

@@ -29,7 +29,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from sioms.simulation.control import number, serve
 from sioms.simulation.faults import Faults
 
-from .lines import ILLEGAL_FUNCTION, TcpLine
+from .lines import ILLEGAL_FUNCTION, TcpLine, bits_from_0
 
 READ_BACK = 0x200
 TIME, FUNCTIONS, TRIGGER, SHORTEST, STOP, STATUS, RESTART, SIMPLE_STOP = (
@@ -186,8 +186,7 @@ def simulated(coupler: Coupler) -> SimDevice:
         current[address - start : address - start + count] = result
         return None
 
-    bits = [SimData(0, count=READ_BACK + 512, values=0, datatype=DataType.BITS)]
-    inputs = [SimData(0, count=READ_BACK + 512, values=0, datatype=DataType.BITS)]
+    bits, inputs = [bits_from_0(READ_BACK + 512)], [bits_from_0(READ_BACK + 512)]
     holding = [SimData(0, count=SERIES + 8, values=0, datatype=DataType.REGISTERS)]
     registers = [SimData(0, count=SERIES + 8, values=0, datatype=DataType.REGISTERS)]
     return SimDevice(1, simdata=(bits, inputs, holding, registers), action=action)
