@@ -7,7 +7,6 @@ simulated device loads it only where a file is given, and knows nothing of who w
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import entry_points
 from typing import Any, Protocol
 
 import numpy as np
@@ -96,6 +95,8 @@ def twin(kind: str) -> Any:
     Raises:
         ValueError: no package that is installed does.
     """
+    from importlib.metadata import entry_points  # takes as long as all of the plant; most devices have no such file
+
     for point in entry_points(group=GROUP, name=kind):
         return point.load()
     raise ValueError(f"model_file: no installed package makes a twin ({kind}); its entry point goes to [{GROUP}]")

@@ -11,7 +11,6 @@ import sys
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from functools import cache
-from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +23,7 @@ from sioms.protocol.text import shown
 from sioms.wording import choices, did_you_mean, every_error, explain, field_names
 
 from .driver import Driver, LineDriver, StreamDriver, TickDriver
+from .registry import Point, entry_points
 
 GROUP = "sioms.drivers"
 
@@ -33,8 +33,8 @@ class DriverNotFound(Exception):
 
 
 @cache
-def _registered() -> Mapping[str, Any]:
-    return {point.name: point for point in entry_points(group=GROUP)}
+def _registered() -> Mapping[str, Point]:
+    return entry_points(GROUP)
 
 
 def driver_names() -> list[str]:

@@ -239,5 +239,5 @@ def _solve(matrix: Extended, right: Extended) -> Extended:
         factor = table[:, :, column].copy()
         factor[:, column] = 0.0
         table -= factor[:, :, None] * table[:, None, column]
-    answer: Extended = table[:, :, size:]
+    answer: Extended = table[:, :, size:].copy()  # a view would keep the whole table, as long as answers are kept
     return answer

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from skfem.helpers import ddot, sym_grad, trace
 
 from sioms.tactile import emap, halfplane, series
-from sioms.tactile.cylinder import FINGER_A, FINGER_B, Cylinder, respond
+from sioms.tactile.cylinder import FINGER_A, FINGER_B, Cylinder, _amplitudes, _basis_many, respond
 
 SHAPES = [(0.05, 0.0), (0.3, 0.3), (0.7, 0.5), (0.756, 0.46), (0.95, 0.2), (0.99, 0.5)]
 WAVES = [0, 1, 2, 3, 7, 20]
@@ -191,3 +191,9 @@ def test_bad_geometry_is_refused() -> None:
         Cylinder(9e-3, 12.7e-3, 0.51)
     with pytest.raises(ValueError, match=r"outside the layer; need 0\.0096 to 0\.0127 m"):
         respond(FINGER_B, 1, 9e-3)
+
+
+def test_amplitudes_that_are_kept_keep_nothing_else():
+    body = Cylinder(3e-3, 6e-3, 0.45, 1e6)
+    kept = _amplitudes(body, (2.0, 3.0), _basis_many)
+    assert kept.base is None and kept.shape == (2, 4, 2)
