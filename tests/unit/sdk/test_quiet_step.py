@@ -2,14 +2,20 @@
 
 import ctypes
 import os
+import random
 import select
 import time
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from served_writes_rig import Served, queue_of
 
 from sioms.native.language import library
+from sioms.protocol.flags import ControlMode, NodeClass
+from sioms.protocol.messages import decode_reply
+from sioms.protocol.records import AXIS_WRITE, WRITE
+from sioms.protocol.verbs import Write
 from sioms.sdk import quiet_step
 from sioms.sdk.quiet import QuietRun
 from sioms.sdk.quiet_step import (
@@ -321,6 +327,68 @@ def test_of_many_devices_only_those_with_more_to_do_are_the_loops(make):
         count = run_many(many)
         assert set(ready[:count].tolist()) == {device.poll.fileno() for device in devices[1:]}
     assert [len(device.ticks) for device in devices] == [1, 1, 0]
+
+
+def plain_write(served):
+    """Return a packet that steps serve: a position of an axis at rest, in its limits."""
+    record = dict.fromkeys(WRITE[NodeClass.AXIS], 0) | {"control_mode": int(ControlMode.POSITION), "position": 0.1}
+    packet = Write(1, 0.0, AXIS_WRITE.pack(*record.values())).packed(7)
+    assert served.desk.count == 1
+    return packet
+
+
+@pytest.fixture
+def writing(make):
+    """A device with a writer, whose socket the loop waits for."""
+    request, queue = os.memfd_create("request"), queue_of(random.Random(0))
+    for latched in (queue.latched, queue.home_required, queue.waiting):
+        latched[:] = 0
+    served = Served(queue, request)
+    device = make(desk=served.desk, expired=0)
+    device.poll.register(served.theirs.fileno(), select.EPOLLIN)
+    yield device, served
+    served.close()
+    os.close(request)
+
+
+def test_a_write_is_served_and_the_tick_that_carries_it_out_is_the_loops(writing):
+    device, served = writing
+    os.eventfd_write(device.timer, 1)
+    served.ours.send(plain_write(served))
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0, (
+        "the tick, then the write"
+    )
+    assert len(device.ticks) == 1 and served.desk.kept == 1 and decode_reply(served.answer())[1:4] == [7, 0, 8]
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0))
+    assert device.quiet.left and device.quiet.expired == 1
+    assert len(device.ticks) == 1, "it has to work in what was written first"
+
+
+def test_the_work_before_a_rare_tick_is_the_loops_when_something_was_written(make, writing):
+    device, served = writing
+    device.quiet.lead_ns = 200_000
+    served.ours.send(plain_write(served))
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0))
+    assert not device.slacks and device.quiet.expired == 1
+
+
+@pytest.mark.parametrize("what", [STOPPED, RESETS, ORDERS, "heeded", "two"])
+def test_a_write_waits_for_what_comes_before_it(writing, what):
+    device, served = writing
+    if what == "heeded":
+        device.quiet.heeded_ns = 5
+    elif what == "two":
+        os.eventfd_write(device.other, 1)
+    else:
+        device.latch[what] += 1
+    packet = plain_write(served)
+    served.ours.send(packet)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0))
+    assert served.theirs.fileno() in device.ready[: device.quiet.waiting]
+    assert not served.desk.kept and served.left() == packet
 
 
 def page(pipes=(), every=()):
