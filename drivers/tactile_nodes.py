@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 from sioms.documents import read_text
 from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, BlockSpec
-from sioms.sdk.driver import Awaited, Kit, Refusal
+from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec
+from sioms.sdk.driver import Awaited, Driver, Kit, Refusal
 from sioms.sdk.inputs import NotMeasuredError
 
 if TYPE_CHECKING:
@@ -259,6 +259,33 @@ def _tare(settings: ShapeSettings) -> LoadTare | None:
         return LoadTare(settings.load_scale, settings.load_deviation, 2.0)
     except ValueError as error:
         raise ValueError(f"shape: {error}") from None
+
+
+class FingerDriver(Driver):
+    """What drivers have in common whose channels may be the elements of a finger; beside their own kind of driver.
+
+    Concurrency: the one thread of the driver process.
+    """
+
+    _block: AnalogBlock
+    _finger: TactileNodes | None
+
+    def _make_blocks(self, specs: Sequence[BlockSpec], shape: ShapeSettings | None) -> None:
+        """Make the block of the channels, and the nodes of a finger where there is one."""
+        first, *more = specs
+        self._block = AnalogBlock(first)
+        self._finger = TactileNodes(shape, more, self.kit) if shape is not None else None
+
+    @property
+    def blocks(self) -> Sequence[AnyBlock]:
+        """The channels; of a finger its strains and shape, too."""
+        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
+
+    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
+        """Answer the requests of a finger's nodes."""
+        if self._finger is None or not block.name:
+            return super().ioctl(block, request, channels, argument)
+        return self._finger.ioctl(block, request, argument)
 
 
 def _finger(settings: ShapeSettings, elements: int) -> Finger:

@@ -291,6 +291,15 @@ class _Raises:
         return True
 
 
+def reads(node: Any) -> bool:
+    """Tell whether a node can be read."""
+    try:
+        node.read()
+    except OSError:
+        return False
+    return True
+
+
 def at_rest(node: Any, timeout_s: float = 5.0) -> float:
     """Wait until all axes of a node are at rest; return how long it took [s]."""
     began = time.monotonic()

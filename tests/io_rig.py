@@ -7,12 +7,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
-from steps_rig import carry_out
+from steps_rig import Exchanging
 
 from sioms.drivers.modbus.io import IoUnit, ModbusIo
 from sioms.drivers.modbus.simulated import moxa, wago
 from sioms.sdk.codec.modbus import frame_tcp
-from sioms.sdk.exchange import Exchange, Pause, Step, Steps
+from sioms.sdk.exchange import Exchange
 
 EXCHANGE_S = 0.002
 
@@ -28,7 +28,7 @@ class Kit:
         self.said.append(text)
 
 
-class Joined:
+class Joined(Exchanging):
     """A block and its driver; each exchange takes 2 ms.
 
     Attributes:
@@ -40,7 +40,7 @@ class Joined:
     """
 
     def __init__(self, make: Callable[[Callable[[], float]], Any], **table: Any) -> None:
-        self.now_s = 1000.0
+        super().__init__(EXCHANGE_S)
         self.device = make(lambda: self.now_s)
         self.sent: list[str] = []
         self.busy = 0
@@ -73,20 +73,11 @@ class Joined:
         spec = next(block.spec for block in self.unit.blocks if block.spec.channels[0].name == port)
         self.run(self.unit.write_outputs(spec, [0], [value]))
 
-    def run(self, steps: Steps) -> Any:
-        """Carry out a hook to its end."""
-        return carry_out(steps, self._carry)
-
-    def _carry(self, step: Step) -> Any:
-        if isinstance(step, Pause):
-            self.now_s += step.duration_s
-            return None
-        assert isinstance(step, Exchange)
-        self.now_s += EXCHANGE_S
-        self.sent.append(step.data[7:].hex(" "))
-        reply = frame_tcp(int.from_bytes(step.data[:2], "big"), step.data[6], self._answer(step.data[7:]))
-        assert step.want(reply) == len(reply)
-        return step.decode(reply)
+    def reply(self, exchange: Exchange) -> bytes:
+        """Return what the block answers."""
+        request = exchange.data
+        self.sent.append(request[7:].hex(" "))
+        return frame_tcp(int.from_bytes(request[:2], "big"), request[6], self._answer(request[7:]))
 
     def _answer(self, pdu: bytes) -> bytes:
         function, address = pdu[0], int.from_bytes(pdu[1:3], "big")

@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
-from steps_rig import carry_out
+from steps_rig import Exchanging
 
 from sioms.drivers.modbus.axis import ModbusAxis
 from sioms.drivers.modbus.simulated import leadshine, oriental_az
@@ -17,7 +17,7 @@ from sioms.protocol.flags import AxisStatus, ControlMode
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.records import NodeClass, numpy_dtype
 from sioms.sdk.codec.modbus import frame_rtu
-from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Pause, Step, Steps
+from sioms.sdk.exchange import DeviceError, Exchange, LinkError
 from sioms.sdk.markers import Markers
 
 EXCHANGE_S = 0.003
@@ -35,11 +35,11 @@ class Kit:
         self.said.append(text)
 
 
-class Bus:
+class Bus(Exchanging):
     """A line whose drives are register models; each exchange takes 3 ms of the invented time."""
 
     def __init__(self) -> None:
-        self.now_s = 1000.0
+        super().__init__(EXCHANGE_S)
         self.drives: dict[int, Any] = {}
         self.sent: list[bytes] = []
         self.broken: Callable[[Exchange], bytes | None] = lambda exchange: None
@@ -62,20 +62,10 @@ class Bus:
             return frame_rtu(request[0], bytes((function | 0x80, int(refused))))
         return request if function == 6 else frame_rtu(request[0], request[1:6])
 
-    def run(self, steps: Steps) -> Any:
-        """Run a hook to its end."""
-        return carry_out(steps, self._carry)
-
-    def _carry(self, step: Step) -> Any:
-        if isinstance(step, Pause):
-            self.now_s += step.duration_s
-            return None
-        assert isinstance(step, Exchange)
-        self.now_s += EXCHANGE_S
-        self.sent.append(step.data)
-        reply = self.broken(step) or self.answer(step.data)
-        assert step.want(reply) == len(reply)
-        return step.decode(reply)
+    def reply(self, exchange: Exchange) -> bytes:
+        """Return what comes from the line."""
+        self.sent.append(exchange.data)
+        return self.broken(exchange) or self.answer(exchange.data)
 
 
 class Rig:

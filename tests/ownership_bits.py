@@ -22,7 +22,7 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from ownership_cell import Cell, _of_clients, cells
-from ownership_fakes import CLOCK, FIRST_UID, LEASE_S, PROCESSES, Client
+from ownership_fakes import CLOCK, DEVICES_TABLE, FIRST_UID, GRANTS, LEASE_S, PROCESSES, Client
 
 from sioms.protocol.messages import MAX_PACKET, ClientVerb, HandleVerb, decode, encode
 from sioms.protocol.records import BINARY_WRITE
@@ -138,25 +138,6 @@ def _gone(s: State, c: int) -> State:
 
 # --- the real objects ------------------------------------------------------------------------------------
 
-BITS = """
-[workcell]
-name = "bits"
-daemon_lease_s = 0.5
-[[grant]]
-users = ["client0", "client1"]
-rights = ["read", "write", "stop"]
-[[grant]]
-users = ["client0"]
-rights = ["administer"]
-[[grant]]
-users = ["client2"]
-rights = ["read", "stop"]
-{guest}
-[device.axis]
-driver = "axis"
-[device.port]
-driver = "port"
-"""
 GUESTS = f'[[grant]]\nusers = ["client2"]\nrights = ["read", "write"]\nnodes = ["{GRANTED}"]\n'
 
 
@@ -173,7 +154,8 @@ class BitCell(Cell):
             self.connect(c)
 
     def _configure(self) -> None:
-        self.config.write_text(BITS.format(guest=GUESTS if self.guest else ""))
+        guests = GUESTS if self.guest else ""
+        self.config.write_text(GRANTS.format("") + guests + DEVICES_TABLE.format(0, 0))
 
     def settle(self) -> None:
         """Let all happen that happens by itself."""

@@ -24,10 +24,11 @@ from typing import Any
 import pytest
 from ownership_fakes import (
     CLOCK,
-    CONFIG,
     DAEMON_LEASE_S,
+    DEVICES_TABLE,
     DRIVERS,
     FIRST_UID,
+    GRANTS,
     LEASE_S,
     NAMES,
     PROCESSES,
@@ -137,7 +138,8 @@ class Cell:
         self._load()
 
     def _configure(self) -> None:
-        self.config.write_text(CONFIG.format(*self.variants, guest=', "client2"' if self.guest else ""))
+        guest = ', "client2"' if self.guest else ""
+        self.config.write_text(GRANTS.format(guest) + DEVICES_TABLE.format(*self.variants))
 
     def _load(self) -> None:
         errors: list[str] = []

@@ -13,13 +13,8 @@ from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from ownership_cell import Cell, cells
-from ownership_model import (
-    follow,
-)
-from ownership_promises import (
-    Broken,
-    promise,
-)
+from ownership_model import follow
+from ownership_promises import Broken, promise
 from ownership_state import (
     CLIENTS,
     FAULT,
@@ -33,9 +28,7 @@ from ownership_state import (
     Held,
     State,
 )
-from ownership_steps import (
-    actions,
-)
+from ownership_steps import actions
 
 BEGINNINGS: dict[str, list[Action]] = {
     "nobody owns anything": [],
@@ -110,6 +103,14 @@ def settle(state: State) -> tuple[State, list[Action]]:
     return state, way
 
 
+def first_of(way: Iterable[Action]) -> State:
+    """Return where a way leads, names apart."""
+    state = State()
+    for action in way:
+        state, _ = follow(state, action)
+    return typical(state)
+
+
 Graph = dict[State, list[tuple[Action, State, str]]]
 
 
@@ -120,10 +121,7 @@ def explore(way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lam
     Raises:
         Broken: a promise does not hold; with the steps that lead there.
     """
-    state = State()
-    for action in way:
-        state, _ = follow(state, action)
-    first = typical(state)
+    first = first_of(way)
     graph: Graph = {}
     came: dict[State, tuple[State, Action] | None] = {first: None}
     rests: set[State] = set()
@@ -133,10 +131,7 @@ def explore(way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lam
         for state in front:
             steps = graph[state] = []
             for action in actions(state):
-                try:
-                    after, answer = follow(state, action)
-                except Broken as error:
-                    raise Broken(f"{error}, after {trace(came, state)} and then {action}") from None
+                after, answer = _after(state, action, came)
                 steps.append((action, after, answer))
                 alike = typical(after)
                 if alike not in came:
@@ -156,10 +151,7 @@ def explore_all(way: Iterable[Action], requests: int) -> tuple[int, int]:
     Raises:
         Broken: a promise does not hold; with the steps that lead there.
     """
-    state = State()
-    for action in way:
-        state, _ = follow(state, action)
-    first = typical(state)
+    first = first_of(way)
     came: dict[State, tuple[State, Action] | None] = {first: None}
     taken, done, count = {first: 0}, set[State](), 0
     rests: set[State] = set()
@@ -175,10 +167,7 @@ def explore_all(way: Iterable[Action], requests: int) -> tuple[int, int]:
                 by_itself = action[0] in SYSTEM
                 if not by_itself and used == requests:
                     continue
-                try:
-                    after, _ = follow(state, action)
-                except Broken as error:
-                    raise Broken(f"{error}, after {trace(came, state)} and then {action}") from None
+                after, _ = _after(state, action, came)
                 count += 1
                 alike, cost = typical(after), used + (not by_itself)
                 if alike not in taken:
@@ -188,6 +177,14 @@ def explore_all(way: Iterable[Action], requests: int) -> tuple[int, int]:
                     (front if by_itself else new).append(alike)
         front = new
     return len(done), count
+
+
+def _after(state: State, action: Action, came: dict[State, tuple[State, Action] | None]) -> tuple[State, str]:
+    """Take a step; of a promise that it breaks, tell how one comes there."""
+    try:
+        return follow(state, action)
+    except Broken as error:
+        raise Broken(f"{error}, after {trace(came, state)} and then {action}") from None
 
 
 def _see_rest(state: State, rests: set[State]) -> None:

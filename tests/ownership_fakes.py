@@ -26,12 +26,12 @@ from sioms.sdk.runtime import Runtime
 
 NAMES = ("axis", "port")
 """The devices: an axis that the host moves, and a port of two bits whose outputs are safe at 0."""
-CONFIG = """
+GRANTS = """
 [workcell]
 name = "model"
 daemon_lease_s = 0.5
 [[grant]]
-users = ["client0", "client1"{guest}]
+users = ["client0", "client1"{0}]
 rights = ["read", "write", "stop"]
 [[grant]]
 users = ["client0"]
@@ -39,6 +39,9 @@ rights = ["administer"]
 [[grant]]
 users = ["client2"]
 rights = ["read", "stop"]
+"""
+"""Who may what; the place is for one more who may write."""
+DEVICES_TABLE = """
 [device.axis]
 driver = "axis"
 variant = {0}

@@ -32,9 +32,9 @@ import msgspec
 import numpy as np
 
 from sioms.drivers import tactile_nodes
-from sioms.protocol.flags import AnalogStatus, NodeClass, Request
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, StreamDriver
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, Send, Steps
@@ -100,7 +100,7 @@ class AsciiStreamSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     shape: tactile_nodes.ShapeSettings | None = None
 
 
-class AsciiStream(StreamDriver):
+class AsciiStream(tactile_nodes.FingerDriver, StreamDriver):
     """A device that prints its samples.
 
     Concurrency: the one thread of the driver process.
@@ -141,9 +141,7 @@ class AsciiStream(StreamDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         self.silence_s = max(0.25, 20 / settings.rate_hz)
-        first, *more = self.describe(name, settings).blocks
-        self._block = AnalogBlock(first)
-        self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
+        self._make_blocks(self.describe(name, settings).blocks, settings.shape)
         n = self._block.n
         self._scale = np.array(_each(settings.scale, n), dtype=np.float64)
         self._offset = np.array(_each(settings.offset, n), dtype=np.float64)
@@ -163,11 +161,6 @@ class AsciiStream(StreamDriver):
         self._character_ns = 1e9 * line.bits_per_character / line.baud if line.serial else 0.0
         self._stamp_ns = 0
         self._dropped = 0
-
-    @property
-    def blocks(self) -> Sequence[AnyBlock]:
-        """The channels; of a finger its strains and shape, too."""
-        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
 
     def open(self) -> Steps:
         """Wait for the greeting and a good line; tell what is wrong with the lines when none comes."""
@@ -218,12 +211,6 @@ class AsciiStream(StreamDriver):
         """Tell the device to be silent, where it knows how."""
         if self.settings.stop:
             yield Send(self.settings.stop.encode("ascii"), "stop")
-
-    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
-        """Answer the requests of a finger's nodes."""
-        if self._finger is None or not block.name:
-            return super().ioctl(block, request, channels, argument)
-        return self._finger.ioctl(block, request, argument)
 
     def _is_fresh(self, row: tuple[float, ...], now_ns: int) -> bool:
         """Tell whether a line is a new sample; raises LinkError when its time says that the board has restarted."""

@@ -26,9 +26,9 @@ import msgspec
 import numpy as np
 
 from sioms.drivers import tactile_nodes
-from sioms.protocol.flags import AnalogStatus, NodeClass, Request
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.codec.sequence import SequenceWatch
 from sioms.sdk.device_clock import DeviceClock
 from sioms.sdk.driver import Kit, StreamDriver
@@ -84,7 +84,7 @@ class FramedAdcSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     shape: tactile_nodes.ShapeSettings | None = None
 
 
-class FramedAdc(StreamDriver):
+class FramedAdc(tactile_nodes.FingerDriver, StreamDriver):
     """A front end that pushes blocks of samples.
 
     Concurrency: the one thread of the driver process.
@@ -142,9 +142,7 @@ class FramedAdc(StreamDriver):
         super().__init__(name, settings, kit)
         self.line = settings.line
         self.silence_s = max(0.25, 20 / settings.rate_hz)
-        first, *more = self.describe(name, settings).blocks
-        self._block = AnalogBlock(first)
-        self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
+        self._make_blocks(self.describe(name, settings).blocks, settings.shape)
         self._scale = np.broadcast_to(np.array(settings.scale, dtype=np.float64), settings.channels)
         self._offset = np.broadcast_to(np.array(settings.offset, dtype=np.float64), settings.channels)
         self._receiver = FrameReceiver()
@@ -155,11 +153,6 @@ class FramedAdc(StreamDriver):
         self._since_us: int | None = None
         self._granted_hz = 0.0
         self._foreign = 0
-
-    @property
-    def blocks(self) -> Sequence[AnyBlock]:
-        """The channels; of a finger its strains and shape, too."""
-        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
 
     def open(self) -> Steps:
         """Ask the device what it is, compare, and start the stream."""
@@ -280,12 +273,6 @@ class FramedAdc(StreamDriver):
                 "warning",
                 f"{self.name}: the device sends {hz:.1f} blocks a second, not rate_hz = {wanted_hz:g}",
             )
-
-    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
-        """Answer the requests of a finger's nodes."""
-        if self._finger is None or not block.name:
-            return super().ioctl(block, request, channels, argument)
-        return self._finger.ioctl(block, request, argument)
 
     def _not_this(self, what: str) -> DeviceError:
         return DeviceError(errno.ENODEV, f"identify {self.name} on {self.line}: the device {what}")

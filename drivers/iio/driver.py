@@ -30,9 +30,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.drivers import tactile_nodes
-from sioms.protocol.flags import AnalogStatus, NodeClass, Request
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description
 from sioms.sdk.driver import Driver, Kit, StreamDriver, TickDriver
 from sioms.sdk.exchange import LinkError, Steps
 from sioms.sdk.golden import Golden, Incomplete
@@ -82,7 +82,7 @@ class IioSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     dev: str = "/dev"
 
 
-class Iio(StreamDriver):
+class Iio(tactile_nodes.FingerDriver, StreamDriver):
     """Scans of a buffer.
 
     Concurrency: the one thread of the driver process.
@@ -138,17 +138,6 @@ class Iio(StreamDriver):
         except LinkError as error:
             raise OSError(errno.ENODEV, str(error)) from None
         return LineSettings(path=f"{self.settings.dev}/{folder.name}")
-
-    @property
-    def blocks(self) -> Sequence[AnyBlock]:
-        """The channels; of a finger its strains and shape, too."""
-        return _all(self._block, self._finger)
-
-    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
-        """Answer the requests of a finger's nodes."""
-        if self._finger is None or not block.name:
-            return super().ioctl(block, request, channels, argument)
-        return self._finger.ioctl(block, request, argument)
 
     def open(self) -> Steps:
         """Set up the scan, then switch the buffer on; a driver that was killed may have left it on."""
@@ -258,7 +247,7 @@ class Iio(StreamDriver):
         return int(AnalogStatus.OVERRUN) if missing > 0 else 0
 
 
-class IioRaw(TickDriver):
+class IioRaw(tactile_nodes.FingerDriver, TickDriver):
     """Attributes read one by one.
 
     Concurrency: the one thread of the driver process; a slow converter keeps it, and its tick, for as long as a
@@ -276,17 +265,6 @@ class IioRaw(TickDriver):
         super().__init__(name, settings, kit)
         self._block, self._finger = _blocks(settings, kit)
         self._failed = 0
-
-    @property
-    def blocks(self) -> Sequence[AnyBlock]:
-        """The channels; of a finger its strains and shape, too."""
-        return _all(self._block, self._finger)
-
-    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
-        """Answer the requests of a finger's nodes."""
-        if self._finger is None or not block.name:
-            return super().ioctl(block, request, channels, argument)
-        return self._finger.ioctl(block, request, argument)
 
     def open(self) -> None:
         """Find the device and how its channels are scaled."""
@@ -320,34 +298,28 @@ class IioRaw(TickDriver):
         return {"failed_readings": self._failed}
 
 
-class _Finger:
+class _Finger(tactile_nodes.TactileNodes):
     """The nodes of a finger behind a converter: values become the finger's raw unit first.
 
     Concurrency: the one thread of the driver process.
     """
 
-    def __init__(self, nodes: tactile_nodes.TactileNodes, settings: IioSettings) -> None:
-        self._nodes, self._factor = nodes, np.asarray(settings.element_scale, dtype=np.float64)
+    def __init__(self, settings: IioSettings, shape: tactile_nodes.ShapeSettings, specs: Sequence[BlockSpec], kit: Kit):
+        super().__init__(shape, specs, kit)
+        self._factor = np.asarray(settings.element_scale, dtype=np.float64)
         self._offset = np.asarray(settings.element_offset, dtype=np.float64)
-        self.blocks, self.ioctl = nodes.blocks, nodes.ioctl
 
     def take(
-        self, values: NDArray[np.float64], flags: NDArray[np.int64], stamp_ns: int, now_ns: int,
+        self, raw: NDArray[np.float64], flags: NDArray[np.int64], stamp_ns: int, now_ns: int,
         begun_ns: int | None = None,
     ) -> tuple[AnalogBlock, ...]:  # fmt: skip
         """Sense one frame, as ``TactileNodes.take``."""
-        return self._nodes.take((values - self._offset) * self._factor, flags, stamp_ns, now_ns, begun_ns)
+        return super().take((raw - self._offset) * self._factor, flags, stamp_ns, now_ns, begun_ns)
 
 
 def _blocks(settings: IioSettings, kit: Kit) -> tuple[AnalogBlock, _Finger | None]:
     first, *more = _describe(settings).blocks
-    if settings.shape is None:
-        return AnalogBlock(first), None
-    return AnalogBlock(first), _Finger(tactile_nodes.TactileNodes(settings.shape, more, kit), settings)
-
-
-def _all(block: AnalogBlock, finger: _Finger | None) -> Sequence[AnyBlock]:
-    return (block,) if finger is None else (block, *finger.blocks)
+    return AnalogBlock(first), _Finger(settings, settings.shape, more, kit) if settings.shape else None
 
 
 class _Scaling:

@@ -20,7 +20,6 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,9 +29,9 @@ from sioms.documents import read_bytes, toml_of
 from sioms.drivers import tactile_nodes
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.plant.foreign import TwinFinger, twin
-from sioms.protocol.flags import AnalogStatus, NodeClass, Request
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
-from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description
+from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.driver import Kit, TickDriver
 from sioms.sdk.tables import from_table, table_type
 
@@ -77,7 +76,7 @@ class SimTactileSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True
     shape: tactile_nodes.ShapeSettings | None = None
 
 
-class SimTactile(TickDriver):
+class SimTactile(tactile_nodes.FingerDriver, TickDriver):
     """A simulated tactile array.
 
     Concurrency: the one thread of the driver process.
@@ -112,9 +111,7 @@ class SimTactile(TickDriver):
 
     def __init__(self, name: str, settings: SimTactileSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        first, *more = self.describe(name, settings).blocks
-        self._block = AnalogBlock(first)
-        self._finger = tactile_nodes.TactileNodes(settings.shape, more, kit) if settings.shape else None
+        self._make_blocks(self.describe(name, settings).blocks, settings.shape)
         self._array = _twin(settings) if settings.model_file else _array(settings)
         if settings.curvature_node and isinstance(self._array, TactileArray):
             self._array.mount_all()
@@ -122,11 +119,6 @@ class SimTactile(TickDriver):
             self._array.mount(settings.indenter_radius_m)
         self._touch: tuple[float | None, ...] = (None, None, None)
         self._seen: tuple[float | None, ...] = (None, None, None)
-
-    @property
-    def blocks(self) -> Sequence[AnyBlock]:
-        """The elements; their strains and shape, too, where that is asked for."""
-        return (self._block,) if self._finger is None else (self._block, *self._finger.blocks)
 
     def tick(self, now_ns: int) -> None:
         """Read force and angle; while a device is not there the reading is invalid."""
@@ -148,12 +140,6 @@ class SimTactile(TickDriver):
         """Whether the finger is touched as it was at the last look: noise that nobody sees need not be made."""
         at_rest, self._seen = self._touch == self._seen, self._touch
         return at_rest
-
-    def ioctl(self, block: BlockSpec, request: Request, channels: Sequence[int], argument: Any) -> Any:
-        """Answer the requests of the finger's nodes."""
-        if self._finger is None or not block.name:
-            return super().ioctl(block, request, channels, argument)
-        return self._finger.ioctl(block, request, argument)
 
     def _value(self, node: str, now_ns: int) -> float | None:
         """Return a node's value, 0 for no node, None while its device is not there or says that it is invalid."""

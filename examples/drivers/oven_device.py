@@ -1,8 +1,7 @@
 """The oven controller of ``oven.toml``, simulated on Modbus RTU: ``python oven_device.py --link PATH``.
 
 Written from its manual: two zones that warm towards what their heaters give, a two-point controller each, a watchdog
-    that
-switches the heaters off. Commands on standard input, beside those of the line: ``state``.
+that switches the heaters off. Commands on standard input, beside those of the line: ``state``.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ from collections.abc import Callable
 from pymodbus.constants import ExcCodes
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from sioms.drivers.modbus.simulated.lines import RtuLine, serial_parser
+from sioms.drivers.modbus.simulated.lines import Asked, RtuLine, serial_parser, served
 from sioms.simulation.control import serve
 from sioms.simulation.faults import Faults
 
@@ -75,34 +74,26 @@ class Oven:
 def simulated(oven: Oven) -> SimDevice:
     """Return pymodbus's device: coils of their own, and the same words for both kinds of registers."""
 
-    async def action(
-        function: int,
-        start: int,
-        address: int,
-        count: int,
-        current: list[int],
-        values: list[int] | list[bool] | None,
-    ) -> ExcCodes | None:
+    def serve(asked: Asked) -> ExcCodes | None:
         oven.pass_time()
         oven.heard_s = oven.clock()
-        if values is not None:
-            numbers = [int(value) for value in values]
-            if function in (5, 15):
-                oven.on[address : address + len(numbers)] = numbers[: 2 - address]
+        if asked.values is not None:
+            if asked.function in (5, 15):
+                oven.on[asked.address : asked.address + len(asked.values)] = asked.values[: 2 - asked.address]
                 return None
-            return oven.write(address, numbers)
-        if function == 1:
-            current[0] = oven.on[0] | oven.on[1] << 1
-        elif function == 3:
-            image = oven.registers()
-            if any(at not in image for at in range(address, address + count)):
+            return oven.write(asked.address, asked.values)
+        if asked.function == 1:
+            asked.current[0] = oven.on[0] | oven.on[1] << 1
+        elif asked.function == 3:
+            image, wanted = oven.registers(), range(asked.address, asked.address + asked.count)
+            if any(at not in image for at in wanted):
                 return ExcCodes.ILLEGAL_ADDRESS
-            current[address - start : address - start + count] = [image[at] for at in range(address, address + count)]
+            return asked.answer([image[at] for at in wanted])
         return None
 
     coils = [SimData(0, count=16, values=0, datatype=DataType.BITS)]
     words = [SimData(0, count=64, values=0, datatype=DataType.REGISTERS)]
-    return SimDevice(1, simdata=(coils, coils, words, words), action=action)
+    return served(1, (coils, coils, words, words), serve)
 
 
 async def main() -> None:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from daemon_rig import Daemon, axes, raises, wait_for
+from daemon_rig import Daemon, axes, raises, reads, wait_for
 
 import sioms
 
@@ -61,18 +61,10 @@ def _good(node: sioms.Node) -> bool:
 def _recovered(cell: sioms.Workcell) -> sioms.Node:
     """Open the bridge again, reset it and wait until it is good."""
     node = cell.open("bridge", "rw", timeout=10.0)
-    wait_for(lambda: _reads(node), "the bridge has found its axes")
+    wait_for(lambda: reads(node), "the bridge has found its axes")
     node.reset()
     wait_for(lambda: _good(node), "the bridge is good")
     return node
-
-
-def _reads(node: sioms.Node) -> bool:
-    try:
-        node.read()
-    except OSError:
-        return False
-    return True
 
 
 def test_a_gantry_drives_what_it_holds_and_all_halt_together(start_daemon: Callable[..., Daemon]) -> None:
@@ -152,7 +144,7 @@ def test_a_slow_one_stops_what_is_left_without_waiting_for_its_tick(start_daemon
         daemon.wait_up("bridge")
         bridge = cell.open("bridge", "rw")
         with cell.open("mod0.readonly", "r") as below:
-            wait_for(lambda: _reads(bridge), "the bridge has found its axes")
+            wait_for(lambda: reads(bridge), "the bridge has found its axes")
             go(bridge, velocity=[0.02, 0.02, 0.0])
             wait_for(lambda: max(map(abs, below.read().velocity)) > 0.01, "it moves")
             ticked_ns = bridge.read().stamp_ns

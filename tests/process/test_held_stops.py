@@ -6,7 +6,7 @@ import errno
 import time
 from collections.abc import Callable
 
-from daemon_rig import Daemon, axes, raises, wait_for
+from daemon_rig import Daemon, axes, raises, reads, wait_for
 
 import sioms
 from sioms.protocol.flags import AxisStatus
@@ -58,14 +58,6 @@ def _is_barred(node: sioms.Node) -> bool:
     return bool(int(node.read().status[0]) & (AxisStatus.FAULT | STOPPED))
 
 
-def _reads(node: sioms.Node) -> bool:
-    try:
-        node.read()
-    except OSError:
-        return False
-    return True
-
-
 def _stands(node: sioms.Node) -> bool:
     return bool(max(map(abs, node.read().velocity)) < 1e-3)
 
@@ -75,7 +67,7 @@ def test_a_stop_after_a_reset_stays_however_soon_it_comes(start_daemon: Callable
     with daemon.cell() as cell, daemon.cell() as other:
         daemon.wait_up("slits")
         slits, blades = cell.open("slits", "rw"), cell.open("blades.readonly", "r")
-        wait_for(lambda: _reads(slits), "the slits have found their blades", 5.0)
+        wait_for(lambda: reads(slits), "the slits have found their blades", 5.0)
         lost = []
         for trial in range(12):
             stop_first = (cell.emergency_stop_workcell, lambda: cell.emergency_stop("blades"))[trial % 2]
@@ -104,7 +96,7 @@ def test_a_held_device_that_ticks_but_takes_no_orders_is_stopped_and_said_to_be_
     with daemon.cell() as cell:
         daemon.wait_up("slits")
         slits, blades = cell.open("slits", "rw"), cell.open("blades.readonly", "r")
-        wait_for(lambda: _reads(slits), "the slits have found their blades", 5.0)
+        wait_for(lambda: reads(slits), "the slits have found their blades", 5.0)
         slits.write([sioms.command(0, velocity=0.1)])
         wait_for(lambda: blades.read().velocity[1] > 0.09, "motion", 5.0)
         (daemon.folder / "deaf").touch()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import errno
 import os
-import signal
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -14,20 +13,15 @@ from typing import Any
 
 import pytest
 import zmq
-from daemon_rig import Client, Daemon, jog, raises, wait_for
+from daemon_rig import Client, Daemon, raises, wait_for
+from remote_rig import halts_within_the_lease
 
 import sioms
 import sioms.aio
-from sioms.bench.watching import Watch, halting_ns
 from sioms.check.remote import Gateway, Relay, free_ports
 from sioms.client.keys import Folder
 from sioms.gateway.inflow import MOST
 from sioms.protocol.link import DEFAULT_LEASE_S
-
-LATE_NS = int((DEFAULT_LEASE_S + 0.020) * 1e9)
-"""Within which whatever fails halts what it held."""
-BUSY_NS = 100_000_000
-"""More for a machine that runs other tests at the same time; `sioms bench reach` has the figures."""
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +36,6 @@ def remote(daemon: Daemon, gate: Gateway) -> Iterator[sioms.Workcell]:
     """A session through it."""
     with sioms.Workcell(gate.socket, "far") as cell:
         yield cell
-
-
-def _keeping(lease: float = 0.0) -> str:
-    return jog("mod0.xaxis", 0.2, lease) + "while True:\n    node.keepalive(); time.sleep(0.01)\n"
 
 
 def test_the_library_is_the_same_and_others_hear_whose_it_is(remote: sioms.Workcell, cell: sioms.Workcell) -> None:
@@ -150,39 +140,7 @@ def test_the_pipe_tools_and_the_front_door_are_the_same(daemon: Daemon, gate: Ga
 def test_whatever_fails_halts_what_was_held_within_the_lease(
     what: str, daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
 ) -> None:
-    with Gateway(daemon.socket) as gate, Relay(gate.port) as relay, cell.open("mod0.xaxis.readonly") as seen:
-        gate.socket = gate.trusted(relay.port)
-        victim = client(gate, _keeping())
-        watch = Watch(seen)
-        time.sleep(0.3)
-        assert seen.read().commanded_velocity[0] == pytest.approx(0.2), "who is alive keeps its motion"
-        begin = time.monotonic_ns()
-        hung = {"client hung": victim.pid, "gateway hung": gate.process.pid}.get(what, 0)
-        if hung:
-            os.kill(hung, signal.SIGSTOP)
-        elif what == "client killed":
-            victim.kill()
-        elif what == "gateway killed":
-            gate.process.kill()
-        elif what == "cut":
-            relay.cut()
-        else:
-            relay.stalled = True
-        try:
-            assert halting_ns(watch, begin) - begin < LATE_NS + BUSY_NS
-            if what == "stalled":
-                relay.stalled = False  # what was held back comes now, in a burst
-            if hung:
-                os.kill(hung, signal.SIGCONT)
-            time.sleep(0.3)
-            assert not seen.read().in_motion[0], "nothing resumes"
-            with cell.open("mod0.xaxis", "rw", timeout=2.0):
-                pass
-            if what != "client killed":
-                victim.wait_line("Error")
-        finally:
-            if hung:
-                os.kill(hung, signal.SIGCONT)
+    halts_within_the_lease(what, Gateway, daemon, cell, client)
 
 
 def test_a_link_that_delays_serves_and_one_that_doubles_ends_with_a_sentence(daemon: Daemon, gate: Gateway) -> None:

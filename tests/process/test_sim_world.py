@@ -7,7 +7,7 @@ import os
 import signal
 from collections.abc import Callable
 
-from daemon_rig import Daemon, wait_for
+from daemon_rig import Daemon, reads, wait_for
 
 import sioms
 from sioms.client.snapshot import AxisSnapshot
@@ -44,19 +44,11 @@ driver = "sim-axes"
 )
 
 
-def _reads(node: sioms.Node) -> bool:
-    try:
-        node.read()
-    except OSError:
-        return False
-    return True
-
-
 def test_a_killed_world_stops_the_axes_that_lean_on_it(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon(CELL)
     with daemon.cell() as cell:
         axis = cell.open("mod0.x", "rw")
-        wait_for(lambda: _reads(axis), "the axes have found their world")
+        wait_for(lambda: reads(axis), "the axes have found their world")
         wait_for(lambda: _goes_to(axis, 0.003), "the finger to press")
         with cell.open("world.left.normal") as normal:
             assert 0.5 < float(normal.read().data[0]) < 12.0

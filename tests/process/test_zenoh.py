@@ -14,22 +14,19 @@ from types import SimpleNamespace
 
 import pytest
 import zenoh
-from daemon_rig import Client, Daemon, jog, raises, wait_for
+from daemon_rig import Client, Daemon, raises, wait_for
+from remote_rig import halts_within_the_lease
 from zenoh.handlers import Callback
 
 import sioms
-from sioms.bench.watching import Watch, halting_ns
-from sioms.check.remote import Relay, ZenohGateway
+from sioms.check.remote import ZenohGateway
 from sioms.client.keys import VARIABLE, Folder
 from sioms.client.zenoh_keys import ALIVE, DOWN, STOP, UP, config, endpoint
 from sioms.client.zenoh_link import ZenohLink
 from sioms.gateway import certificates
 from sioms.protocol import link
-from sioms.protocol.link import DEFAULT_LEASE_S, Up
+from sioms.protocol.link import Up
 from sioms.protocol.verbs import EmergencyStop
-
-LATE_NS = int((DEFAULT_LEASE_S + 0.020) * 1e9) + 100_000_000
-"""Within which whatever fails halts what it held, on a machine that runs other tests."""
 
 
 @pytest.fixture(scope="module")
@@ -72,27 +69,7 @@ def test_the_library_is_the_same(daemon: Daemon, gate: ZenohGateway, cell: sioms
 def test_whatever_fails_halts_what_was_held_within_the_lease(
     what: str, daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client]
 ) -> None:
-    with ZenohGateway(daemon.socket) as gate, Relay(gate.port) as relay, cell.open("mod0.xaxis.readonly") as seen:
-        gate.socket = gate.trusted(relay.port)
-        victim = client(gate, jog("mod0.xaxis", 0.2) + "while True:\n    node.keepalive(); time.sleep(0.01)\n")
-        watch = Watch(seen)
-        time.sleep(0.3)
-        assert seen.read().commanded_velocity[0] == pytest.approx(0.2), "who is alive keeps its motion"
-        begin = time.monotonic_ns()
-        if what == "client killed":
-            victim.kill()
-        elif what == "gateway killed":
-            gate.process.kill()
-        elif what == "cut":
-            relay.cut()
-        else:
-            relay.stalled = True
-        assert halting_ns(watch, begin) - begin < LATE_NS
-        relay.stalled = False  # what was held back comes now, in a burst
-        time.sleep(0.3)
-        assert not seen.read().in_motion[0], "nothing resumes"
-        if what != "client killed":
-            victim.wait_line("Error")
+    halts_within_the_lease(what, ZenohGateway, daemon, cell, client)
 
 
 def _session(gate: ZenohGateway, folder: Folder) -> zenoh.Session:

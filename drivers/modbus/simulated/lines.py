@@ -13,9 +13,10 @@ import asyncio
 import contextlib
 import logging
 import socket
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from pymodbus.constants import ExcCodes
 from pymodbus.framer.rtu import FramerRTU
@@ -52,9 +53,50 @@ def bits_from_0(count: int) -> SimData:
     return SimData(0, values=[0] * (count // 16), datatype=DataType.BITS)
 
 
-def simulated(unit: int, device: Registers, ranges: Iterable[tuple[int, int]]) -> SimDevice:
-    """Return pymodbus's device with holding registers in these (first, count) ranges, all others illegal."""
-    data = [SimData(first, count=count, values=0, datatype=DataType.REGISTERS) for first, count in ranges]
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A request as pymodbus hands it over.
+
+    Attributes:
+        function, address, count: of the request.
+        start: address of the first element of ``current``; of bits: of words of 16.
+        current: what pymodbus answers a read with.
+        values: of a write; None for a read.
+    """
+
+    function: int
+    start: int
+    address: int
+    count: int
+    current: list[int]
+    values: list[int] | None
+
+    def answer(self, words: list[int] | ExcCodes) -> ExcCodes | None:
+        """Answer with words, or refuse."""
+        if isinstance(words, ExcCodes):
+            return words
+        self.current[self.address - self.start : self.address - self.start + self.count] = words
+        return None
+
+    def answer_bits(self, bits: Sequence[int], base: int = 0) -> ExcCodes | None:
+        """Answer with the bits that lie from an address on: pymodbus keeps them packed, and asks for whole words."""
+        first = (self.address - base) // 16 * 16
+        if self.address - base >= max(1, len(bits)):
+            return ExcCodes.ILLEGAL_ADDRESS
+        for word in range(self.count):
+            part = bits[first + 16 * word : first + 16 * word + 16]
+            self.current[(base + first) // 16 - self.start + word] = sum(bit << i for i, bit in enumerate(part))
+        return None
+
+
+def served(unit: int, data: Any, serve: Callable[[Asked], ExcCodes | None]) -> SimDevice:
+    """Return pymodbus's device that serves requests, but for the reads of what has just been written.
+
+    Args:
+        unit: its address on the line.
+        data: pymodbus's SimData, in its four blocks or in one: what there is.
+        serve: carries out a write, or answers a read; returns why not.
+    """
 
     async def action(
         function: int,
@@ -64,17 +106,24 @@ def simulated(unit: int, device: Registers, ranges: Iterable[tuple[int, int]]) -
         current: list[int],
         values: list[int] | list[bool] | None,
     ) -> ExcCodes | None:
-        if values is not None:
-            return device.write(function, address, [int(value) for value in values])
-        if function in (5, 6):
+        if values is None and function in (5, 6):
             return None  # pymodbus reads back what it just stored, for the echo
-        result = device.read(function, address, count)
-        if isinstance(result, ExcCodes):
-            return result
-        current[address - start : address - start + count] = result
-        return None
+        written = None if values is None else [int(value) for value in values]
+        return serve(Asked(function, start, address, count, current, written))
 
     return SimDevice(unit, simdata=data, action=action)
+
+
+def simulated(unit: int, device: Registers, ranges: Iterable[tuple[int, int]]) -> SimDevice:
+    """Return pymodbus's device with holding registers in these (first, count) ranges, all others illegal."""
+    data = [SimData(first, count=count, values=0, datatype=DataType.REGISTERS) for first, count in ranges]
+
+    def serve(asked: Asked) -> ExcCodes | None:
+        if asked.values is not None:
+            return device.write(asked.function, asked.address, asked.values)
+        return asked.answer(device.read(asked.function, asked.address, asked.count))
+
+    return served(unit, data, serve)
 
 
 def crc_is_right(frame: bytes) -> bool:

@@ -23,7 +23,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from sioms.simulation.control import number, serve
 from sioms.simulation.faults import Faults
 
-from .lines import TcpLine, bits_from_0
+from .lines import Asked, TcpLine, bits_from_0, served
 
 # model -> discrete inputs, outputs, analog inputs, first register of the analog inputs
 MODELS = {
@@ -161,43 +161,24 @@ class Block:
 def simulated_block(block: Block) -> SimDevice:
     """Return pymodbus's device for the block."""
 
-    async def action(
-        function: int,
-        start: int,
-        address: int,
-        count: int,
-        current: list[int],
-        values: list[int] | list[bool] | None,
-    ) -> ExcCodes | None:
-        if function in (5, 6) and values is None:
-            return None  # pymodbus reads back what it just stored, for the echo
+    def serve(asked: Asked) -> ExcCodes | None:
         block.hear()
-        if function in (1, 2):
-            # pymodbus keeps bits packed in words, and asks for whole words
-            if function == 1 and address == WATCHDOG_ALARM:
-                current[address // 16 - start] = int(block.alarm)
+        if asked.function in (1, 2):
+            if asked.function == 1 and asked.address == WATCHDOG_ALARM:
+                asked.current[asked.address // 16 - asked.start] = int(block.alarm)
                 return None
-            first = address // 16 * 16
-            bits = block.do if function == 1 else block.di
-            for word in range(count):
-                part = bits[first + 16 * word : first + 16 * word + 16]
-                current[first // 16 - start + word] = sum(bit << i for i, bit in enumerate(part))
-            return None if address < max(1, len(bits)) else ExcCodes.ILLEGAL_ADDRESS
-        if function in (5, 15) and values is not None:
-            return block.write_bits(address, [int(value) for value in values])
-        if function == 4:
-            result = block.read_input(address, count)
-            if isinstance(result, ExcCodes):
-                return result
-            current[address - start : address - start + count] = result
-            return None
+            return asked.answer_bits(block.do if asked.function == 1 else block.di)
+        if asked.function in (5, 15) and asked.values is not None:
+            return block.write_bits(asked.address, asked.values)
+        if asked.function == 4:
+            return asked.answer(block.read_input(asked.address, asked.count))
         return ExcCodes.ILLEGAL_FUNCTION
 
     coils = [bits_from_0(WATCHDOG_ALARM + 16)]
     inputs = [SimData(0, count=2, values=0, datatype=DataType.BITS)]
     holding = [SimData(0x20, count=1, values=0, datatype=DataType.REGISTERS)]
     registers = [SimData(0, count=5040, values=0, datatype=DataType.REGISTERS)]
-    return SimDevice(1, simdata=(coils, inputs, holding, registers), action=action)
+    return served(1, (coils, inputs, holding, registers), serve)
 
 
 async def run() -> None:

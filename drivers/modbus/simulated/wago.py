@@ -29,7 +29,7 @@ from pymodbus.simulator import DataType, SimData, SimDevice
 from sioms.simulation.control import number, serve
 from sioms.simulation.faults import Faults
 
-from .lines import ILLEGAL_FUNCTION, TcpLine, bits_from_0
+from .lines import ILLEGAL_FUNCTION, Asked, TcpLine, bits_from_0, served
 
 READ_BACK = 0x200
 TIME, FUNCTIONS, TRIGGER, SHORTEST, STOP, STATUS, RESTART, SIMPLE_STOP = (
@@ -155,54 +155,29 @@ class Coupler:
 def simulated(coupler: Coupler) -> SimDevice:
     """Return pymodbus's device for the coupler."""
 
-    async def action(
-        function: int,
-        start: int,
-        address: int,
-        count: int,
-        current: list[int],
-        values: list[int] | list[bool] | None,
-    ) -> ExcCodes | None:
-        if function in (5, 6) and values is None:
-            return None  # pymodbus reads back what it just stored, for the echo
+    def serve(asked: Asked) -> ExcCodes | None:
+        function, address, values = asked.function, asked.address, asked.values
         coupler.hear(function)
         if coupler.fails(address, values):
             return ExcCodes.DEVICE_FAILURE
-        if function in (1, 2):
-            return _bits(coupler, start, address, count, current)
+        if function in (1, 2):  # both read the same
+            return asked.answer_bits(coupler.do, READ_BACK) if address >= READ_BACK else asked.answer_bits(coupler.di)
         if function in (5, 15) and values is not None:
             first = address - READ_BACK if address >= READ_BACK else address
             if first + len(values) > len(coupler.do):
                 return ExcCodes.ILLEGAL_ADDRESS
-            coupler.set_outputs(first, [int(value) for value in values])
+            coupler.set_outputs(first, values)
             return None
         if function in (6, 16) and values is not None:
-            return coupler.write(address, [int(value) for value in values])
+            return coupler.write(address, values)
         if function not in (3, 4):
             return ILLEGAL_FUNCTION
-        result = coupler.read(function, address, count)
-        if isinstance(result, ExcCodes):
-            return result
-        current[address - start : address - start + count] = result
-        return None
+        return asked.answer(coupler.read(function, address, asked.count))
 
     bits, inputs = [bits_from_0(READ_BACK + 512)], [bits_from_0(READ_BACK + 512)]
     holding = [SimData(0, count=SERIES + 8, values=0, datatype=DataType.REGISTERS)]
     registers = [SimData(0, count=SERIES + 8, values=0, datatype=DataType.REGISTERS)]
-    return SimDevice(1, simdata=(bits, inputs, holding, registers), action=action)
-
-
-def _bits(coupler: Coupler, start: int, address: int, count: int, current: list[int]) -> ExcCodes | None:
-    """Fill whole words with bits, as pymodbus keeps them; functions 1 and 2 read the same."""
-    base = READ_BACK if address >= READ_BACK else 0
-    bits = coupler.do if base else coupler.di
-    if address - base >= max(1, len(bits)):
-        return ExcCodes.ILLEGAL_ADDRESS
-    first = (address - base) // 16 * 16
-    for word in range(count):
-        part = bits[first + 16 * word : first + 16 * word + 16]
-        current[(base + first) // 16 - start + word] = sum(bit << i for i, bit in enumerate(part))
-    return None
+    return served(1, (bits, inputs, holding, registers), serve)
 
 
 async def run() -> None:

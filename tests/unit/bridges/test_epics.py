@@ -179,13 +179,18 @@ def test_nan_stops_and_what_is_reloaded_or_gone_is_not_shown_as_before(
     assert client.get("lab:mod0:xaxis.RBV", timeout=5.0) == 0.125
 
 
-def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -> None:
+def mover() -> tuple[epics.Bridge, list[Any]]:
+    """Return a bridge that may move, and the calls that come to who would hold the axes."""
     calls: list[Any] = []
     held = SimpleNamespace(
         put=lambda *words: calls.append(words), move=lambda *words: calls.append(words), shown=lambda _: (0.5, 0, "x"),
         sweep=lambda: None,
     )  # fmt: skip
-    bridge = epics.Bridge("", Putters(), held)  # type: ignore[arg-type]
+    return epics.Bridge("", Putters(), held), calls  # type: ignore[arg-type]
+
+
+def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -> None:
+    bridge, calls = mover()
     bridge.look()
     with serving(bridge) as client:
         client.put("mod0.LEASE", 0.5, timeout=5.0)
@@ -207,12 +212,7 @@ def test_where_one_cannot_listen_is_told(bridge: epics.Bridge) -> None:
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be two users")
 def test_a_stranger_of_this_machine_reads_but_puts_nothing(cell: Cell) -> None:
     """He may say of himself what he likes: the kernel knows who has made his connection."""
-    calls: list[Any] = []
-    held = SimpleNamespace(
-        put=lambda *words: calls.append(words), move=lambda *words: calls.append(words), shown=lambda _: (0.5, 0, "x"),
-        sweep=lambda: None,
-    )  # fmt: skip
-    bridge = epics.Bridge("", Putters(), held)  # type: ignore[arg-type]
+    bridge, calls = mover()
     bridge.look()
     puts = [("mod0.LEASE", 0.5), ("mod0:xaxis.VAL", 0.1), ("mod0:xaxis.STOP", 1)]
     with serving(bridge):
