@@ -361,7 +361,7 @@ class NodeVerbs:
                 self._then.remove(entry)
                 entry[1]()
 
-    def device_gone(self, device: DriverProcess, reason: str) -> None:
+    def device_gone(self, device: DriverProcess) -> None:
         """Void all handles of a driver process that is no more."""
         for handle in [h for h in self._handles.values() if h.node.device == device.name]:
             self._forget(handle)

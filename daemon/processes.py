@@ -74,7 +74,7 @@ class Processes:
         """Void the handles of a process that is no more, and stop what is tied to it."""
         device.trouble = ""
         self._holds.device_gone(device)
-        self._nodes.device_gone(device, reason)
+        self._nodes.device_gone(device)
         self._alarms.gone(device, reason)
         if device.state is not State.DOWN and device.device.common.on_loss == "stop":
             self._stops.stop_workcell(f"device {device.name} lost: {reason}")

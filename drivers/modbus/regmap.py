@@ -156,7 +156,6 @@ class DeadMan(Schema, frozen=True):
         by: "refresh": a command must be sent again within ``timeout_s``; "link": any message counts;
             "none": the device goes on.
         timeout_s: of the device [s].
-        covers: control modes that end by it.
         refresh: commands that must be sent again (by = "refresh").
         proof: what is read while it is set and runs: after ``commands.watchdog``, where the map has that, and in the
             polls. A device that reads otherwise is not opened, or opened again.
@@ -166,7 +165,6 @@ class DeadMan(Schema, frozen=True):
 
     by: Literal["refresh", "link", "none"] = "none"
     timeout_s: float = 0.0
-    covers: tuple[str, ...] = ()
     refresh: tuple[str, ...] = ()
     proof: tuple[Proof, ...] = ()
     tripped: Proof | None = None
@@ -202,8 +200,6 @@ class Alarms(Schema, frozen=True):
     """Codes that only a power cycle clears."""
     place_lost: tuple[int, ...] = ()
     """Codes after which the position means nothing until the axis is homed or calibrated."""
-    bitmask: bool = False
-    """The signal is a set of flags, not a number."""
 
 
 class Axis(Schema, frozen=True):

@@ -64,13 +64,11 @@ class Fitted:
         coefficient: while it slides.
         sticks: whether it sticks and slips by turns.
         cycle_hz: of that; nan where it slides evenly.
-        fluctuation: standard deviation of tangential over normal force.
     """
 
     coefficient: float
     sticks: bool
     cycle_hz: float
-    fluctuation: float
 
 
 def curvature_on_finger(radius_m: float) -> float:
@@ -134,7 +132,7 @@ def fit(tangential: Floats, normal: Floats, noise_n: float, rate_hz: float = RAT
     if sticks:  # whole cycles
         cycles = max(int(len(force) * hz / rate_hz), 1)
         force = force[: round(cycles * rate_hz / hz)]
-    return Fitted(float(np.mean(force)) / load, sticks, hz if sticks else math.nan, float(np.std(rest)) / load)
+    return Fitted(float(np.mean(force)) / load, sticks, hz if sticks else math.nan)
 
 
 @dataclass(frozen=True, slots=True)

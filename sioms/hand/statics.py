@@ -7,36 +7,11 @@ grasp matrix.  f > 0 squeezes.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
-
-
-def grasp_matrix(contact1: Sequence[float], contact2: Sequence[float]) -> Floats:
-    """Return G, shape (3, 4): the wrench (fx, fy, moment about the origin) of the forces (f1x, f1y, f2x, f2y)."""
-    return np.array(
-        [
-            [1.0, 0.0, 1.0, 0.0],
-            [0.0, 1.0, 0.0, 1.0],
-            [-contact1[1], contact1[0], -contact2[1], contact2[0]],
-        ]
-    )
-
-
-def contact_forces(internal: float, eta1: float, eta2: float) -> tuple[float, float, float, float]:
-    """Return (normal 1, tangential 1, normal 2, tangential 2) [N] of an internal force [N] at friction angles [rad].
-
-    Tangential forces of the fingers on the object, counter-clockwise of the normal positive.
-    """
-    return (
-        internal * math.cos(eta1),
-        internal * math.sin(eta1),
-        internal * math.cos(eta2),
-        internal * math.sin(eta2),
-    )
 
 
 def damper_limit(stiffness: float, sample_s: float, late: int = 0) -> float:

@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 import math
-from typing import Final
 
 from sioms.native.language import Flags, Floats, Record, step
 from sioms.native.numbers import nearest
 
 from .friction_step import Friction, glide, keep
-
-PI: Final = math.pi
 
 
 class Steppers(Record):

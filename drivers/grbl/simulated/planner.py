@@ -22,7 +22,6 @@ class Block:
 
     target: list[float]
     feed: float
-    is_jog: bool
 
 
 class Planner:
@@ -51,7 +50,7 @@ class Planner:
         """Take a block; a jog after a cancel that has come to its end is a new one."""
         if jog and not self.blocks:
             self.cancelling = False
-        self.blocks.append(Block(target, feed, jog))
+        self.blocks.append(Block(target, feed))
 
     def clear(self) -> None:
         """Forget all blocks and holds; the speed is somebody else's matter."""

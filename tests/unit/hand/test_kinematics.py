@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sioms.hand.kinematics import Hand, wrap
-from sioms.hand.statics import contact_forces, damper_factor, damper_limit, grasp_matrix
+from sioms.hand.statics import damper_factor, damper_limit
 
 HAND = Hand(0.140, 0.150)
 
@@ -67,16 +67,6 @@ def test_fingers_in_one_place_are_refused(d: float) -> None:
 def test_wrap_keeps_half_a_turn_positive() -> None:
     assert wrap(math.pi) == wrap(-math.pi) == wrap(3 * math.pi) == math.pi
     assert wrap(-3.5) == pytest.approx(math.tau - 3.5)
-
-
-def test_internal_force_is_the_null_space_of_the_grasp_matrix() -> None:
-    first, second = np.array([0.01, 0.02]), np.array([0.05, -0.01])
-    matrix = grasp_matrix(first, second)
-    along = (second - first) / np.hypot(*(second - first))
-    assert matrix @ np.concatenate([along, -along]) == pytest.approx([0, 0, 0], abs=1e-15)
-    assert np.linalg.matrix_rank(matrix) == 3
-    normal, tangential, *_ = contact_forces(2.0, 0.2, 0.1)
-    assert math.hypot(normal, tangential) == pytest.approx(2.0) and tangential / normal == pytest.approx(math.tan(0.2))
 
 
 def test_twenty_hertz_limits_the_range_of_the_gains() -> None:
