@@ -121,7 +121,7 @@ class Clients:
                 continue  # the end of another one has ended it
             peer = self.peer_of(session.sock)
             if session.peer.key and not self.may_represent(peer):
-                self.end(session, f"user {peer.user} is no gateway any more")
+                self.end(session, f"user {peer.user} is no longer a gateway")
                 continue
             session.peer = session.peer if session.peer.key else peer
             if not rights.on_workcell(session.peer) & Right.ADMINISTER:

@@ -104,7 +104,7 @@ def _check_folder(folder: str) -> None:
         why = "others may write to it" if owner_is_trusted else f"it belongs to user {about.st_uid}"
         raise OSError(
             errno.EPERM,
-            f"{one}: {why}, who could replace the socket of {folder}'s; want a folder of the daemon's own, as 0755",
+            f"{one}: {why}, who could replace the socket in {folder}; want a folder that the daemon alone may write",
         )
 
 

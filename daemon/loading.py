@@ -269,7 +269,7 @@ def why_no_alarm(alarm: AlarmTable, node: Node | None, names: NameTable) -> str:
         node.bit >= 0 or block.channels[channel].width <= 1 for channel in node.channels
     )
     if alarm.state is not None and not is_bit:
-        return f"state = {alarm.state}; {alarm.node} is no binary node of single bits: want limits, or one bit"
+        return f"state = {alarm.state}; {alarm.node} is not a binary node of single bits; want limits, or one bit"
     if is_bit and alarm.state is None and alarm.column in ("", "data"):
         return f"{alarm.node} is a binary node of single bits; want state = 0 or 1 in the place of limits"
     device = names.devices[node.device].blocks

@@ -19,7 +19,7 @@ from .names import Node
 
 
 class Stops:
-    """What stops, and what keeps it stopped.
+    """The emergency stop of the workcell, and the stops of its nodes.
 
     Args:
         cell: the workcell.

@@ -63,7 +63,7 @@ def json_of(text: str | bytes) -> Any:
     try:
         value = json.loads(plain)
     except RecursionError:
-        raise ValueError(f"arrays or objects nested too deep; at most {DEEPEST} deep is right") from None
+        raise ValueError(f"arrays or objects nested too deep; want at most {DEEPEST} deep") from None
     _check(value, "", 0)
     return value
 
@@ -88,7 +88,7 @@ def _text(text: str | bytes) -> str:
         try:
             plain = text.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise ValueError(f"it is no text in UTF-8 (byte {error.start} is {text[error.start]:#04x})") from None
+            raise ValueError(f"it is not text in UTF-8 (byte {error.start} is {text[error.start]:#04x})") from None
     if len(plain) > 4 * MOST_BYTES:
         raise ValueError(f"it is larger than {4 * MOST_BYTES / 2**20:g} MiB")
     return plain

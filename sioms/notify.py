@@ -22,7 +22,7 @@ class ServiceManager:
         self.watchdog_ns = int(usec) * 500 if wanted and self._address else 0
 
     def tell(self, state: str) -> None:
-        """Send a state, e.g. ``READY=1``; a manager that has gone away is none of our business."""
+        """Send a state, e.g. ``READY=1``; a manager that has gone away is ignored."""
         if self._address:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as sock:
                 sock.settimeout(0.0 if state == "WATCHDOG=1" else 0.1)  # a manager that is late must not stop us

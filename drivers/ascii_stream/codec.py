@@ -43,7 +43,7 @@ class LineReceiver:
 
     def __init__(self, columns: int, checked: bool = False) -> None:
         if columns < 1:
-            raise ValueError(f"columns is {columns}; at least 1 is right")
+            raise ValueError(f"columns is {columns}; want at least 1")
         self.counters = LineCounters()
         self._columns, self._checked = columns, checked
         self._rest = b""

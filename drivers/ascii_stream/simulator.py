@@ -146,7 +146,7 @@ class Board:
 
         def foreign(kind: str, value: str = "0") -> None:
             if kind not in ("start", "stop"):
-                raise ValueError(f"{kind}; one of start, stop is right")
+                raise ValueError(f"{kind}; want one of start, stop")
             if kind == "start":
                 self._run(self.clock())
             else:

@@ -89,7 +89,7 @@ def start(command: Command, timeout_s: float) -> Exchange:
 
     def decode(reply: bytes) -> Record:
         if not reply or len(reply) % RECORD_BYTES:
-            raise LinkError(f"{what}: {len(reply)} bytes came, which are no records of {RECORD_BYTES}")
+            raise LinkError(f"{what}: {len(reply)} bytes received; want records of {RECORD_BYTES}")
         return Record._make(_RECORD.unpack_from(reply))
 
     return Exchange(request(command), want, decode, timeout_s, True, what)

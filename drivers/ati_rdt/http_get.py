@@ -37,7 +37,7 @@ def get(host: str, path: str, parse: Callable[[str], Any], timeout_s: float) -> 
     def decode(reply: bytes) -> Any:
         status, head = _STATUS.match(reply), _END_OF_HEAD.search(reply)
         if status is None or head is None:
-            raise LinkError(f"{what}: {len(reply)} bytes that are no answer of a web server")
+            raise LinkError(f"{what}: {len(reply)} bytes that are not the reply of a web server")
         if status[1] != b"200":
             raise LinkError(f"{what}: the web server answers {status[1].decode()}; is it another device")
         size = want(reply)

@@ -165,7 +165,7 @@ class Sensor:
             elif kind == "rate":
                 self.options.rate, self.page["comrdtrate"] = float(value), value
             else:
-                raise ValueError(f"{kind}; one of zero, client, units, rate is right")
+                raise ValueError(f"{kind}; want one of zero, client, units, rate")
 
         def set_stall(value: bool) -> Callable[[], None]:
             return lambda: setattr(self, "stalled", value)

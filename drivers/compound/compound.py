@@ -236,7 +236,7 @@ class Compound(TickDriver):
         """Wait for all that is held."""
         missing = [held.name for held in self._held if not held.is_there]
         if missing:
-            raise LinkError(f"{missing[0]}: it is not there to be held; want its device up")
+            raise LinkError(f"{missing[0]}: it cannot be held; want its device up")
         joints = [
             Joint(
                 f"{held.name}: {channel.name}" if len(held.channels) > 1 else held.name, channel.unit,
@@ -260,7 +260,7 @@ class Compound(TickDriver):
         taken = self._read(now_ns)
         trouble = [error for held in self._held if (error := held.trouble()) is not None]
         if any(not held.is_there for held in self._held):
-            self._lose(str(trouble[0]) if trouble else "an axis is not held any more")
+            self._lose(str(trouble[0]) if trouble else "an axis is no longer held")
         self.bank.tick(now_ns, np.array(self._at), seen_ns=self._block.stamp_ns)
         if taken.status & _LOST:
             self.bank.lose_place(self._all, "a held axis has lost its place", now_ns)

@@ -87,7 +87,7 @@ def little(value: int, size: int) -> bytes:
     """Return a register of 1, 2 or 4 bytes; raises ValueError when the value does not fit."""
     low, high = (0, 255) if size == 1 else (-(1 << 8 * size - 1), (1 << 8 * size) - 1)
     if not low <= value <= high:
-        raise ValueError(f"value {value} does not fit into {size} bytes; {low} to {high} is right")
+        raise ValueError(f"value {value} does not fit into {size} bytes; want {low} to {high}")
     return (value & (1 << 8 * size) - 1).to_bytes(size, "little")
 
 
@@ -109,7 +109,7 @@ def find(data: bytes, what: str) -> tuple[int, int] | None:
             break
         length = int(unpack_from("<H", data, at + 5)[0])
         if not 3 <= length <= MAX_LENGTH:
-            raise LinkError(f"{what}: the reply tells a length of {length}; 4 to {MAX_LENGTH} is right")
+            raise LinkError(f"{what}: the reply tells a length of {length}; want 4 to {MAX_LENGTH}")
         end = at + length + 7
         if len(data) < end:
             break
@@ -117,7 +117,7 @@ def find(data: bytes, what: str) -> tuple[int, int] | None:
             return at, end
         at = end
     if len(data) > 2 * MAX_LENGTH:
-        raise LinkError(f"{what}: no reply in {len(data)} bytes; one beginning with ff ff fd 00 is right")
+        raise LinkError(f"{what}: no reply in {len(data)} bytes; want one beginning with ff ff fd 00")
     return None
 
 
@@ -209,7 +209,7 @@ def _from(servo: int, size: int, what: str) -> Callable[[bytes], Any]:
         found = find(data, what) or (0, len(data))
         status = parse(data[slice(*found)], what)
         if status.id != servo or len(status.data) != size:
-            raise LinkError(f"{what}: {len(status.data)} bytes from servo {status.id}; {size} from {servo} are right")
+            raise LinkError(f"{what}: {len(status.data)} bytes from servo {status.id}; want {size} from {servo}")
         return status
 
     return decode

@@ -474,7 +474,7 @@ class ServoUnit(AxesUnit):
             )
             raise DeviceError(errno.ERANGE, text)
         if abs(steps) > FARTHEST:
-            text = f"position {position:g} is step {steps} of the servo; {-FARTHEST} to {FARTHEST} is right"
+            text = f"position {position:g} is step {steps} of the servo; want {-FARTHEST} to {FARTHEST}"
             raise DeviceError(errno.ERANGE, text)
         return steps
 

@@ -216,7 +216,7 @@ class Servo:
             return
         modes = {"velocity": 1, "position": 4, "mode": int(value)}
         if kind not in modes:
-            raise ValueError(f"{kind}; velocity, position, torque or mode is right")
+            raise ValueError(f"{kind}; want velocity, position, torque or mode")
         if self.get(11, 1) != modes[kind]:
             self.write(64, b"\0")
             self.write(11, bytes((modes[kind],)))

@@ -70,7 +70,7 @@ def frame(payload: bytes) -> bytes:
         '04 10 c1 f3 00'
     """
     if not 1 <= len(payload) <= MAX_PAYLOAD_BYTES:
-        raise ValueError(f"frame a payload of {len(payload)} bytes: 1 to {MAX_PAYLOAD_BYTES} is right")
+        raise ValueError(f"frame a payload of {len(payload)} bytes: want 1 to {MAX_PAYLOAD_BYTES}")
     return stuff(payload + crc16_ccitt_false(payload).to_bytes(2, "little")) + b"\0"
 
 

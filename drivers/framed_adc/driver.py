@@ -159,7 +159,7 @@ class FramedAdc(tactile_nodes.FingerDriver, StreamDriver):
         settings = self.settings
         about: stream.Hello = yield stream.hello()
         if about.version != stream.PROTOCOL_VERSION:
-            raise self._not_this(f"speaks version {about.version} of the protocol; 1 is right")
+            raise self._not_this(f"speaks version {about.version} of the protocol; want 1")
         if about.channels != settings.channels:
             raise self._not_this(f"has {about.channels} channels; the configuration says {settings.channels}")
         if about.format.name.lower() != settings.format:
@@ -281,7 +281,7 @@ class FramedAdc(tactile_nodes.FingerDriver, StreamDriver):
 def _check(settings: FramedAdcSettings) -> None:
     """Raise ValueError for settings that contradict each other, the frame or the line."""
     if settings.format not in _BYTES:
-        raise ValueError(f"format = {settings.format}; one of {', '.join(_BYTES)} is right")
+        raise ValueError(f"format = {settings.format}; want one of {', '.join(_BYTES)}")
     size = _BYTES[settings.format]
     most = (252 - 10) // size
     if not 1 <= settings.channels <= most:

@@ -240,7 +240,7 @@ class FrontEnd:
             elif kind == "zero":
                 self.zeros = self._forces(self.clock())
             else:
-                raise ValueError(f"{kind}; one of rate, stop, zero is right")
+                raise ValueError(f"{kind}; want one of rate, stop, zero")
 
         return {
             "restart": self.restart,

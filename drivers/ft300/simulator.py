@@ -174,7 +174,7 @@ class Sensor:
 
         def foreign(kind: str, value: str = "0") -> None:
             if kind not in ("stream", "stop"):
-                raise ValueError(f"{kind}; one of stream, stop is right")
+                raise ValueError(f"{kind}; want one of stream, stop")
             self.stream(kind == "stream", self.clock())
 
         def state() -> dict[str, object]:

@@ -209,7 +209,7 @@ def command(line: str, timeout_s: float, *, repeatable: bool = False) -> Exchang
     """
     data = line.encode("ascii") + b"\n"
     if len(data) > LINE_LIMIT or b"\n" in data[:-1]:
-        raise ValueError(f"line {line!r} has {len(data)} characters; one line of up to {LINE_LIMIT} is right")
+        raise ValueError(f"line {line!r} has {len(data)} characters; want one line of up to {LINE_LIMIT}")
     what = f"send {line!r}" if line else "ask for an ok"
 
     def want(reply: bytes) -> int | None:

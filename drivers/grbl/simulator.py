@@ -338,7 +338,7 @@ class Controller:
             "position": f"G90G21G1X{number:g}F1000", "mode": f"G{value}",
         }  # fmt: skip
         if kind not in lines:
-            raise ValueError(f"kind {kind}: one of {', '.join(lines)} is right")
+            raise ValueError(f"kind {kind}: want one of {', '.join(lines)}")
         if self.state == "Alarm":
             self._obey("$X")
         return self._obey(lines[kind])

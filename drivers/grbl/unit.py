@@ -304,7 +304,7 @@ class GrblUnit(AxesUnit):
         self._alarm = 0
 
     def overhear(self, data: bytes, now_ns: int) -> None:
-        """Take what the controller says unasked: alarms, the end of homing, the banner after a reset of its own."""
+        """Take unsolicited messages of the controller: alarms, the end of homing, its banner after a reset."""
         self._rest += data
         lines = grbl.lines_of(self._rest)
         self._rest = self._rest[self._rest.rfind(b"\n") + 1 :][-grbl.LINE_LIMIT :]
@@ -450,7 +450,7 @@ class GrblUnit(AxesUnit):
         self._replaces[axis] = False
         yield self._cancel()
         if not (yield from grbl_opening.brake(self.clock, self._take_heard, self._braking_s())):
-            raise DeviceError(errno.EIO, "the jog that it replaces was cancelled, and the axes move yet")
+            raise DeviceError(errno.EIO, "the jog that it replaces was cancelled, but the axes are still moving")
 
     def _jog_to(self, together: Moves) -> Steps:
         """Send one line for these axes."""

@@ -87,7 +87,7 @@ def parse_type(text: str) -> ElementType:
     """
     match = _TYPE.fullmatch(text.strip())
     if match is None:
-        raise ValueError(f"read a scan type: {text.strip()!r} is none; e.g. le:s12/16>>4 is right")
+        raise ValueError(f"read a scan type: {text.strip()!r} is not one; want e.g. le:s12/16>>4")
     order, sign = match[1], match[2]
     bits, storage, repeat, shift = (int(match[i] or default) for i, default in ((3, 0), (4, 0), (5, 1), (6, 0)))
     if storage not in STORAGE_BITS or not 0 < bits + shift <= storage or bits < 1 or repeat < 1:

@@ -177,7 +177,7 @@ class Dummy:
             "enable": self.root / "buffer/enable",
         }
         if kind not in places:
-            raise ValueError(f"{kind}; one of {', '.join(places)} is right")
+            raise ValueError(f"{kind}; want one of {', '.join(places)}")
         places[kind].write_text(f"{value}\n")
 
     def state(self) -> dict[str, object]:

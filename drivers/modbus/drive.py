@@ -231,7 +231,7 @@ class DriveUnit(LineUnit):
         ramps = {"acceleration": action.acceleration_max, "deceleration": action.acceleration_max}
         if mode & ControlMode.POSITION:
             if mode & ControlMode.VELOCITY:
-                text = "the drive cannot pass a position with a velocity; POSITION alone is right"
+                text = "the drive cannot pass a position with a velocity; want POSITION alone"
                 raise DeviceError(errno.EINVAL, text)
             speed = self._speed(command, mode, action)
             yield from self._mapped.command("position", position=command.position, speed=speed, **ramps)

@@ -188,7 +188,7 @@ class Guard:
             # a time is set down to the next step of its register
             step = self._mapped.step(proof.signal) if proof.source is not None else 0.0
             wrong = not right - step - TOLERANCE <= value <= right + TOLERANCE
-            return f"{proof.signal} is {value:g}; {right:g} is right" if wrong else ""
+            return f"{proof.signal} is {value:g}; want {right:g}" if wrong else ""
         low = -float("inf") if proof.minimum is None else proof.minimum
         high = float("inf") if proof.maximum is None else proof.maximum
-        return "" if low <= value <= high else f"{proof.signal} is {value:g}; {low:g} to {high:g} is right"
+        return "" if low <= value <= high else f"{proof.signal} is {value:g}; want {low:g} to {high:g}"

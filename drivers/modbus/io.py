@@ -141,7 +141,7 @@ def _counts(rmap: RegisterMap, settings: ModbusIoSettings) -> Mapping[str, int]:
             raise ValueError(f"model = {settings.model}: not in the map{did_you_mean(settings.model, rmap.models)}")
         counts |= rmap.models[settings.model]
     elif rmap.models and not settings.channels:
-        raise ValueError(f"model: none given; one of {', '.join(rmap.models)} is right")
+        raise ValueError(f"model: none given; want one of {', '.join(rmap.models)}")
     counts |= settings.channels
     for port, count in counts.items():
         if port not in rmap.ports:

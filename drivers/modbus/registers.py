@@ -64,7 +64,7 @@ def to_words(raw: float, type_name: TypeName, order: WordOrder) -> tuple[int, ..
     if type_name in RANGES:
         low, high = RANGES[type_name]
         if not low <= raw <= high:
-            raise ValueError(f"{raw:g} does not fit a register of type {type_name}; {low} to {high} is right")
+            raise ValueError(f"{raw:g} does not fit a register of type {type_name}; want {low} to {high}")
         raw = int(raw)
     if type_name in ("u16", "i16"):
         return (int(raw) & 0xFFFF,)
@@ -140,7 +140,7 @@ class Gearing:
             ("pulses_per_turn", self.pulses_per_turn),
         ):
             if not math.isfinite(value) or value == 0:
-                raise ValueError(f"{name} is {value}; a finite number other than 0 is right")
+                raise ValueError(f"{name} is {value}; want a finite number other than 0")
 
     def factor(self, unit: Unit) -> float:
         """Return SI per raw number (the reciprocal relation of a time to speed: SI times raw)."""

@@ -85,11 +85,11 @@ def _signals(m: RegisterMap) -> Iterator[str]:
     for name, signal in m.signals.items():
         place = f"signals.{name}"
         if signal.count < 1:
-            yield f"{place}: count is {signal.count}; at least 1 is right"
+            yield f"{place}: count is {signal.count}; want at least 1"
         if signal.type == "text" and signal.words < 1:
             yield f"{place}: a text needs words, the number of registers it takes"
         if signal.scale == 0:
-            yield f"{place}: scale is 0; another number is right"
+            yield f"{place}: scale is 0; want another number"
         if not 0 <= signal.address <= 0x10000 - max(1, signal.span):
             yield f"{place}: address {signal.address:#x} with {signal.span} places leaves 0 to 0xffff"
         most = MAX_READ_BITS if signal.is_bits else MAX_READ_REGISTERS
@@ -127,7 +127,7 @@ def _references(m: RegisterMap) -> Iterator[str]:
     for i, test in enumerate(m.identify):
         yield from _signal(m, f"identify[{i}]", test.signal)
         if test.minimum is None and test.maximum is None and not test.contains and not test.equals_setting:
-            yield f"identify[{i}]: tests nothing; minimum, maximum, contains or equals_setting is right"
+            yield f"identify[{i}]: tests nothing; want minimum, maximum, contains or equals_setting"
 
 
 def _signal(m: RegisterMap, place: str, name: str) -> Iterator[str]:
@@ -141,7 +141,7 @@ def _commands(m: RegisterMap) -> Iterator[str]:
         if name not in COMMANDS:
             yield f"{place}: unknown command{did_you_mean(name, COMMANDS)}"
         elif command.repeat and not COMMANDS[name]:
-            yield f"{place}: repeat is true, but {name} has an effect each time it is sent; false is right"
+            yield f"{place}: repeat is true, but {name} has an effect each time it is sent; want false"
         if not command.writes:
             yield f"{place}: writes nothing"
         yield from _writes(m, place, command)
@@ -152,7 +152,7 @@ def _writes(m: RegisterMap, place: str, command: Command) -> Iterator[str]:
         here = f"{place}.writes[{i}]"
         size = sum(width(item.type) for item in write.items)
         if not 1 <= size <= MAX_WRITE_REGISTERS:
-            yield f"{here}: {size} registers; 1 to {MAX_WRITE_REGISTERS} is right"
+            yield f"{here}: {size} registers; want 1 to {MAX_WRITE_REGISTERS}"
         if not 0 <= write.address <= 0x10000 - size:
             yield f"{here}: address {write.address:#x} with {size} registers leaves 0 to 0xffff"
         if write.function == "single" and size != 1:
@@ -174,7 +174,7 @@ def _item(m: RegisterMap, place: str, item: Item) -> Iterator[str]:
     ways = [name for name in ("value", "source", "values") if getattr(item, name) not in (None, ())]
     if len(ways) != 1:
         count = {0: "neither value nor source", 2: f"both {' and '.join(ways)}"}.get(len(ways), "all of them")
-        yield f"{place}: has {count}; exactly one is right"
+        yield f"{place}: has {count}; want exactly one"
         return
     yield from _alternates(m, place, item)
     for value in item.values if item.value is None else (item.value,):
@@ -185,7 +185,7 @@ def _item(m: RegisterMap, place: str, item: Item) -> Iterator[str]:
     if item.source is None:
         return
     if item.scale == 0:
-        yield f"{place}: scale is 0; another number is right"
+        yield f"{place}: scale is 0; want another number"
     yield from _unit(f"{place}.unit", item.unit)
     yield from _item_source(place, item)
 
@@ -195,9 +195,7 @@ def _alternates(m: RegisterMap, place: str, item: Item) -> Iterator[str]:
     if item.differs_from is not None:
         yield from _signal(m, f"{place}.differs_from", item.differs_from)
         if len(set(item.values)) < 2:
-            yield (
-                f"{place}: values are {list(item.values)}; two that differ are right, one of which changes the register"
-            )
+            yield (f"{place}: values are {list(item.values)}; want two that differ, one of which changes the register")
     elif item.values:
         yield f"{place}: values without differs_from, the signal of the register they change"
 
@@ -208,12 +206,12 @@ def _item_source(place: str, item: Item) -> Iterator[str]:
         yield f"{place}: unknown quantity {source}{did_you_mean(source, SOURCES)}"
     elif item.unit in UNITS and UNITS[item.unit].si != SOURCES[source]:
         right = [name for name, unit in UNITS.items() if unit.si == SOURCES[source]]
-        yield f"{place}: {source} cannot be in {item.unit!r}; one of {', '.join(right)} is right"
+        yield f"{place}: {source} cannot be in {item.unit!r}; want one of {', '.join(right)}"
     if item.type in RANGES:
         low, high = RANGES[item.type]
         for key, bound in (("minimum", item.minimum), ("maximum", item.maximum)):
             if bound is not None and not low <= bound <= high:
-                yield f"{place}: {key} {bound} does not fit type {item.type}; {low} to {high} is right"
+                yield f"{place}: {key} {bound} does not fit type {item.type}; want {low} to {high}"
 
 
 def _axis(m: RegisterMap) -> Iterator[str]:
@@ -251,7 +249,7 @@ def _status(m: RegisterMap) -> Iterator[str]:
         if bit.signal in m.signals:
             bits = 16 * m.signals[bit.signal].span
             if not 0 <= bit.bit < bits:
-                yield f"{place}: bit {bit.bit} of {bit.signal}; 0 to {bits - 1} is right"
+                yield f"{place}: bit {bit.bit} of {bit.signal}; want 0 to {bits - 1}"
             if bit.signal not in m.poll.get("always", ()):
                 yield f"poll.always: {bit.signal} is missing, the status reads it in every poll"
     if not {"moving", "done"} & set(axis.status):
@@ -261,7 +259,7 @@ def _status(m: RegisterMap) -> Iterator[str]:
 def _dead_man(m: RegisterMap) -> Iterator[str]:
     dead = m.dead_man
     if dead.by != "none" and dead.timeout_s <= 0:
-        yield f"dead_man.timeout_s: is {dead.timeout_s} s; more than 0 is right"
+        yield f"dead_man.timeout_s: is {dead.timeout_s} s; want more than 0"
     if dead.by == "refresh" and not dead.refresh:
         yield "dead_man.refresh: names no command that must be sent again"
     if dead.alarm and (m.alarms is None or "reset" not in m.commands):
@@ -289,9 +287,9 @@ def _proofs(m: RegisterMap) -> Iterator[str]:
 
 def _proof(m: RegisterMap, place: str, proof: Proof) -> Iterator[str]:
     if proof.minimum is None and proof.maximum is None and proof.equals is None and proof.source is None:
-        yield f"{place}: tests nothing; equals, minimum, maximum or source is right"
+        yield f"{place}: tests nothing; want equals, minimum, maximum or source"
     if proof.source is not None and proof.source != "timeout":
-        yield f"{place}: unknown quantity {proof.source}; timeout is right"
+        yield f"{place}: unknown quantity {proof.source}; want timeout"
     signal = m.signals.get(proof.signal)
     if signal is not None and (signal.count > 1 or signal.type == "text"):
         yield f"{place}: {proof.signal} is not a single number"
@@ -303,9 +301,9 @@ def _restart(m: RegisterMap) -> Iterator[str]:
         if name:
             yield from _signal(m, f"restart.{key}", name)
     if bool(restart.token) != ("token" in m.commands):
-        yield "restart.token: needs commands.token, which writes it; both or neither is right"
+        yield "restart.token: needs commands.token, which writes it; want both or neither"
     if restart.token and restart.maximum - restart.minimum < 1:
-        yield f"restart: the token is {restart.minimum} to {restart.maximum}; a wider range is right"
+        yield f"restart: the token is {restart.minimum} to {restart.maximum}; want a wider range"
 
 
 def _ports(m: RegisterMap) -> Iterator[str]:
@@ -316,7 +314,7 @@ def _ports(m: RegisterMap) -> Iterator[str]:
         if signal is None:
             continue
         if port.node_class == "binary" and not signal.is_bits:
-            yield f"{place}: binary, but {port.signal} is in the {signal.table} table; coil or discrete is right"
+            yield f"{place}: binary, but {port.signal} is in the {signal.table} table; want coil or discrete"
         if port.node_class == "binary" and signal.count > 62:
             yield f"{place}: {signal.count} bits; a port has at most 62"
         if port.node_class == "analog" and (signal.is_bits or signal.type == "text"):
@@ -325,13 +323,13 @@ def _ports(m: RegisterMap) -> Iterator[str]:
             yield from _fits(f"{place}.minimum", signal, port.minimum)
             yield from _fits(f"{place}.maximum", signal, port.maximum)
         if port.writable and signal.table in ("input", "discrete"):
-            yield f"{place}: writable, but the {signal.table} table is read-only; holding or coil is right"
+            yield f"{place}: writable, but the {signal.table} table is read-only; want holding or coil"
     for model, counts in m.models.items():
         for name, count in counts.items():
             if name not in m.ports:
                 yield f"models.{model}: unknown port {name}{did_you_mean(name, m.ports)}"
             elif (signal := m.signals.get(m.ports[name].signal)) and not 0 <= count <= signal.count:
-                yield f"models.{model}.{name}: {count} channels; 0 to {signal.count} is right"
+                yield f"models.{model}.{name}: {count} channels; want 0 to {signal.count}"
 
 
 def _fits(place: str, signal: Signal, value: float | None) -> Iterator[str]:
@@ -362,7 +360,7 @@ def _golden(m: RegisterMap) -> Iterator[str]:
     for i, frame in enumerate(m.golden):
         place = f"golden[{i}]"
         if bool(frame.command) == bool(frame.signals):
-            yield f"{place}: names {'both' if frame.command else 'neither'} a command and signals; one is right"
+            yield f"{place}: names {'both' if frame.command else 'neither'} a command and signals; want one"
         if frame.command and frame.command not in m.commands:
             yield f"{place}: unknown command {frame.command}{did_you_mean(frame.command, m.commands)}"
         for name in {*frame.signals, *frame.values} - set(m.signals):
@@ -371,4 +369,4 @@ def _golden(m: RegisterMap) -> Iterator[str]:
             try:
                 bytes.fromhex(text)
             except ValueError:
-                yield f"{place}: {text!r} is not hexadecimal; e.g. '01 06 60 02 00 40 37 fa' is right"
+                yield f"{place}: {text!r} is not hexadecimal; want e.g. '01 06 60 02 00 40 37 fa'"

@@ -256,7 +256,7 @@ class MappedUnit:
             bounds = sorted(self.gearing.to_si(bound, unit, item.scale) for bound in (low, high))
         return (
             f"{source} {si:g} is {raw:g} {item.unit} in the register, which takes {low} to {high}; "
-            f"{bounds[0]:.6g} to {bounds[1]:.6g} is right"
+            f"want {bounds[0]:.6g} to {bounds[1]:.6g}"
         )
 
 
@@ -336,4 +336,4 @@ def _differs(test: Identify, value: Any, settings: Mapping[str, Any]) -> str:
         return "" if value == right else f"the configuration says {test.equals_setting} = {right:g}"
     low = -float("inf") if test.minimum is None else test.minimum
     high = float("inf") if test.maximum is None else test.maximum
-    return "" if low <= value <= high else f"{low:g} to {high:g} is right"
+    return "" if low <= value <= high else f"want {low:g} to {high:g}"

@@ -53,7 +53,7 @@ def line(text: str) -> bytes:
     """
     data = text.encode("ascii")
     if len(data) > MAX_LINE - 6 or any(c in data for c in b"\r\n!;*"):
-        raise ValueError(f"line {text[:60]!r}: {len(data)} characters; up to {MAX_LINE - 6} without ! ; * are right")
+        raise ValueError(f"line {text[:60]!r}: {len(data)} characters; want up to {MAX_LINE - 6} without ! ; *")
     return data + f"*{xor8(data)}\n".encode()
 
 
@@ -126,7 +126,7 @@ def exchange(
             for text, limit in zip(texts, limits, strict=False)
         ]
         if [len(each) for each in values] != widths:
-            raise LinkError(f"{what}: replies of {[len(each) for each in values]} numbers; {widths} are right")
+            raise LinkError(f"{what}: replies of {[len(each) for each in values]} numbers; want {widths}")
         del values[len(reads) :]
         if check is not None:
             check(values)

@@ -135,7 +135,7 @@ class OdriveUnit(AxesUnit):
         version = tuple(int(v[0]) for v in (yield odrive.read(paths, self._timeout_s)))
         shown = ".".join(map(str, version))
         if version < OLDEST:
-            text = f"identify {self.name}: firmware {shown} counts positions in encoder counts; at least 0.5.1 is right"
+            text = f"identify {self.name}: firmware {shown} counts positions in encoder counts; want at least 0.5.1"
             raise DeviceError(errno.ENODEV, text)
         if version[:2] != KNOWN:
             self._kit.log("warning", f"{self.name}: firmware {shown}; this driver was made for 0.5")

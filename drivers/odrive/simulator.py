@@ -273,7 +273,7 @@ class Board:
             "position": (f"w {path}input_mode 1", f"p {index} {value}"), "mode": (f"w {path}control_mode {value}",),
         }  # fmt: skip
         if kind not in lines:
-            raise ValueError(f"kind {kind}: one of {', '.join(lines)} is right")
+            raise ValueError(f"kind {kind}: want one of {', '.join(lines)}")
         axis = self.axes[int(index)]
         if kind != "mode" and axis.p["current_state"] != CLOSED_LOOP:
             axis.clear()

@@ -179,7 +179,7 @@ def _exchange(
             raise LinkError(f"{what}: the reply is cut after {len(reply)} bytes")
         body = reply[_HEAD_BYTES:end]
         if len(body) < 2 or body[0] != payload[0]:
-            raise LinkError(f"{what}: the reply {body.hex(' ')} is none to command {payload[0]:02x}")
+            raise LinkError(f"{what}: the reply {body.hex(' ')} does not answer command {payload[0]:02x}")
         if body[1]:
             number, text = _ERRORS.get(body[1], (errno.EIO, "unknown error"))
             raise DeviceError(number, f"{what}: the sensor answers error {body[1]:02x}, {text}")

@@ -234,7 +234,7 @@ class SchunkFt(StreamDriver):
             )
         elif unit.strip(b"\0"):
             number = int.from_bytes(unit, "little")
-            raise _not_this(f"has unit selection {number}; N and N*m, 0, are right: set them on the sensor's page")
+            raise _not_this(f"has unit selection {number}; want 0 (N and N*m): set it on the sensor's page")
         if known != self._known:
             self._known = known
             self.kit.log("info", f"identified {self.name} at {self.settings.line}: {known}")

@@ -164,7 +164,7 @@ class Sensor:
             elif kind == "unit":
                 unit(value)
             else:
-                raise ValueError(f"{kind}; one of zero, tool, filter, stop, unit is right")
+                raise ValueError(f"{kind}; want one of zero, tool, filter, stop, unit")
 
         def shift(count: str) -> None:
             self.counter = (self.counter + int(count)) % 0x10000

@@ -93,7 +93,7 @@ def request(address: int, op: int, kind: int, motor: int, value: int) -> bytes:
         '01 04 00 00 00 00 27 10 3c'
     """
     if not -(2**31) <= value < 2**31:
-        raise ValueError(f"value {value} does not fit; {-(2**31)} to {2**31 - 1} is right")
+        raise ValueError(f"value {value} does not fit; want {-(2**31)} to {2**31 - 1}")
     head = pack(">BBBBi", address, op, kind, motor, value)
     return head + bytes((checksum(head),))
 
@@ -148,7 +148,7 @@ class Module:
                 raise LinkError(f"{what}: the checksum of the reply is wrong ({first.hex(' ')})")
             if first != sent and is_telegram(first):
                 raise LinkError(
-                    f"{what}: the reply goes from {first[1]} to {first[0]}; {self.address} to {self.host} is right"
+                    f"{what}: the reply goes from {first[1]} to {first[0]}; want {self.address} to {self.host}"
                 )
             if len(reply) >= LONGEST:
                 raise LinkError(f"{what}: no reply in {len(reply)} bytes ({reply[:LONGEST].hex(' ')})")
@@ -165,10 +165,10 @@ class Module:
             if status == 1 and host == self.host:  # module and command are those of the last good telegram
                 raise LinkError(f"{what}: the module received a wrong checksum")
             if (host, module) != (self.host, self.address):
-                text = f"{what}: the reply goes from {module} to {host}; {self.address} to {self.host} is right"
+                text = f"{what}: the reply goes from {module} to {host}; want {self.address} to {self.host}"
                 raise LinkError(text)
             if command != op:
-                raise LinkError(f"{what}: the reply answers command {command}; {int(op)} is right")
+                raise LinkError(f"{what}: the reply answers command {command}; want {int(op)}")
             if status not in EXECUTED:
                 errno_, text = STATUS.get(status, (errno.EIO, "unknown"))
                 raise DeviceError(errno_, f"{what}, value {sent}: refused with status {status}, {text}")

@@ -340,7 +340,7 @@ class Module:
             elif kind == "position":
                 self._move(motor, 0, int(number(value)))
             else:
-                raise ValueError(f"{kind}; velocity or position is right")
+                raise ValueError(f"{kind}; want velocity or position")
 
         def brown_out() -> None:
             self.time.catch_up()

@@ -64,7 +64,7 @@ def measure() -> Exchange:
     def decode(reply: bytes) -> Measured:
         match = MEASURED.fullmatch(text_of(reply))
         if match is None:
-            raise LinkError(f"read the outputs: {reply!r} is no reading")
+            raise LinkError(f"read the outputs: {reply!r} is not a reading")
         u1, i1, m1, u2, i2, m2 = match.groups()
         return (float(u1), float(i1), m1 == "CC"), (float(u2), float(i2), m2 == "CC")
 
@@ -76,7 +76,7 @@ def order(text: str) -> Exchange:
 
     def decode(reply: bytes) -> None:
         if text_of(reply) != "OK":
-            raise LinkError(f"send {text!r}: {reply!r} is no answer to it")
+            raise LinkError(f"send {text!r}: {reply!r} does not answer it")
 
     return Exchange(text.encode() + b"\n", line_of, decode, TIMEOUT_S, True, f"send {text!r}")
 

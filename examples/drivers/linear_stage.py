@@ -81,7 +81,7 @@ def state() -> Exchange:
     def decode(reply: bytes) -> State:
         match = STATE.fullmatch(body_of(reply))
         if match is None:
-            raise LinkError(f"read the state: {reply!r} is none")
+            raise LinkError(f"read the state: {reply!r} is not a state")
         return match[1], int(match[2]), int(match[3]), int(match[4])
 
     return Exchange(framed("ST?"), line_of, decode, TIMEOUT_S, True, "read the state")
@@ -92,7 +92,7 @@ def order(text: str) -> Exchange:
 
     def decode(reply: bytes) -> None:
         if (body := body_of(reply)) != "OK":
-            raise LinkError(f"send {text!r}: {body!r} is no answer to it")
+            raise LinkError(f"send {text!r}: {body!r} does not answer it")
 
     return Exchange(framed(text), line_of, decode, TIMEOUT_S, True, f"send {text!r}")
 

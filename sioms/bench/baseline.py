@@ -95,7 +95,7 @@ class Wake:
         os.close(self._answer)
 
     def samples(self, count: int) -> list[int]:
-        """Return the times from the write to the other process awake [ns]; the other is asleep before."""
+        """Return the times from a write until the other process, which slept, runs [ns]."""
         result = []
         for _ in range(count):
             time.sleep(0.001)

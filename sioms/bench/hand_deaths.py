@@ -316,7 +316,7 @@ def _resting(node: Any, after: int, since_ns: int) -> Rest:
         if time.monotonic_ns() - last_ns > 500_000_000 and seen_ns > last_ns:
             return Rest(told_ns - since_ns, moved_ns - since_ns)
         time.sleep(0.02)
-    raise TimeoutError(f"{node.name} moves on; its last reading is of {(seen_ns - since_ns) * 1e-9:.2f} s after")
+    raise TimeoutError(f"{node.name} is still moving; its last reading is of {(seen_ns - since_ns) * 1e-9:.2f} s after")
 
 
 def _slow(velocities: Any) -> bool:

@@ -100,7 +100,7 @@ class Attacker:
             self._sock.send(frame, zmq.DONTWAIT)
 
     def came(self, patience_ms: int = PATIENCE_MS) -> Iterator[tuple[int, int, bytes]]:
-        """Take what comes: kind, channel and body of each frame."""
+        """Receive frames; yield kind, channel and body of each."""
         deadline = time.monotonic() + patience_ms / 1e3
         while (left_s := deadline - time.monotonic()) > 0 and self._sock.poll(max(1, int(1e3 * left_s))):
             kind, channel, _, stamp_ns, body = link.unpack(self._sock.recv(), link.MAX_FROM_GATEWAY)

@@ -260,4 +260,4 @@ def make_ends(kind: str, device_port: str, link: Path) -> tuple[Host, End]:
             return UdpHost(), UdpDevice(device_port)
         case "pushed":
             return PushedHost(), PushedDevice(device_port)
-    raise ValueError(f"make a wire: no kind {kind}; one of {', '.join(KINDS)} is right")
+    raise ValueError(f"make a wire: no kind {kind}; want one of {', '.join(KINDS)}")

@@ -155,7 +155,7 @@ def rig_of(keys: Mapping[str, Any]) -> Rig:
     """
     unknown = sorted(set(keys) - set(Rig.__dataclass_fields__))
     if unknown:
-        raise ValueError(f"rig: unknown key {unknown[0]}; one of {', '.join(Rig.__dataclass_fields__)} is right")
+        raise ValueError(f"rig: unknown key {unknown[0]}; want one of {', '.join(Rig.__dataclass_fields__)}")
     try:
         return msgspec.convert(dict(keys), Rig)
     except msgspec.ValidationError as error:

@@ -66,7 +66,7 @@ def read_trace(path: Path) -> Trace:
     lines = path.read_text(encoding="utf-8", errors="replace").split("\n")
     header = _entry(lines[0], path, 1)
     if header.get("sioms_trace") != VERSION:
-        raise BadTrace(f"read {path}: version {header.get('sioms_trace')} of the format; {VERSION} is right")
+        raise BadTrace(f"read {path}: version {header.get('sioms_trace')} of the format; want {VERSION}")
     messages, events = [], []
     for number, line in enumerate(lines[1:-1], 2):
         entry = _entry(line, path, number)

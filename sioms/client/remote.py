@@ -236,7 +236,7 @@ class _Bridge:
     # --- beginning -------------------------------------------------------------------------------
 
     def begin(self, what: str, deadline: float) -> None:
-        """Have the gateway let us in, and compare clocks.
+        """Log in at the gateway, and compare clocks.
 
         Args:
             what: what is attempted, for messages.

@@ -29,9 +29,9 @@ class _Timex(ctypes.Structure):
 
 
 def wall() -> Wall:
-    """Look at the clocks.
+    """Read both clocks.
 
-    The error is the kernel's ``maxerror``, which whoever disciplines the clock keeps, and the kernel lets grow.
+    The error is the kernel's ``maxerror``: set by the service that disciplines the clock, and growing in between.
     """
     before = time.monotonic_ns()
     utc_ns = time.time_ns()

@@ -80,7 +80,7 @@ class ZeroMq:
         return peer[:1] == b"\0"
 
     def send(self, peer: bytes, frame: bytes) -> bool:
-        """Send a frame to a client; False when it has gone, or takes no more."""
+        """Send a frame to a client; return False if it has disconnected or its queue is full."""
         try:
             self._router.send_multipart((peer, frame), zmq.DONTWAIT)
         except zmq.ZMQError:

@@ -202,7 +202,7 @@ class LoadingAxis:
                 if seen and seen[-1].tick > taken and not seen[-1].in_motion[0]:
                     raise ExperimentStopped(
                         f"feel for a surface with {self.axis.name}: no {until_n:.3g} N on {self.force.name} up to "
-                        f"{end:.4g} m; see to the force, the place and what is to be pressed"
+                        f"{end:.4g} m; check the force sensor, the place and what is to be pressed"
                     )
         self.axis.stop()
         stamps = [s.stamp_ns for s in forces]

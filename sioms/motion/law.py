@@ -124,7 +124,7 @@ class ControlLaw:
         return position, np.where(stepper, self.output[axes], self._velocity[axes])
 
     def is_on_its_way(self, axes: NDArray[np.int64], rest: Vector) -> NDArray[np.bool_]:
-        """Tell which axes move, and are far from where their set-points rest (m,), or have been let go."""
+        """Tell which axes (m,) move and are still far from their final setpoints, or have been released."""
         error = np.where(self.stepper[axes], self._error[axes], rest - self._position[axes])
         on_its_way: NDArray[np.bool_] = (np.abs(error) > self._tolerance[axes]) | self.limp[axes]
         return on_its_way & self.moves(axes)

@@ -374,7 +374,7 @@ def uncommanded_text(axis: AxisSettings, reference: float, place: float, velocit
     """Say that an axis does not hold; places in unit, velocity in unit/s."""
     unit, most = axis.unit, tolerance_of(axis)
     text = f"axis {axis.name} moves though nothing was commanded: from {reference:.6g} to {place:.6g} {unit}"
-    return f"{text} at {velocity:.3g} {unit}/s; at most {most:.3g} {unit} is right"
+    return f"{text} at {velocity:.3g} {unit}/s; at most {most:.3g} {unit} is allowed"
 
 
 def lost_text(axis: AxisSettings, before: float, place: float, within_s: float | None) -> str:

@@ -191,7 +191,7 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
     Request.HOME: (Right.WRITE, True, False, "start homing"),
     Request.SET_LIMITS: (Right.WRITE, True, False, "set limits, within the configured ones"),
     Request.GET_LIMITS: (Right.READ, False, True, "return the limits in force"),
-    Request.FLUSH: (Right.WRITE, True, False, "empty the buffers; the running command goes on"),
+    Request.FLUSH: (Right.WRITE, True, False, "empty the buffers; the running command continues"),
     Request.CANCEL_WAITS: (Right.WRITE | Right.ADMINISTER, False, False, "end the waits of all sessions on the node"),
     Request.GET_STATISTICS: (Right.READ, False, True, "return tick times and link counters"),
     Request.GET_DIAGNOSTICS: (Right.READ, False, True, "return raw position, offset, retries and misses of axes"),

@@ -32,7 +32,7 @@ def obey(line: str, handlers: Mapping[str, Handler]) -> str:
         return f"ok {json.dumps(sorted(handlers))}"
     handler = handlers.get(words[0])
     if handler is None:
-        return f"error unknown command {words[0]}; one of {', '.join(sorted(handlers))} is right"
+        return f"error unknown command {words[0]}; want one of {', '.join(sorted(handlers))}"
     try:
         value = handler(*words[1:])
     except (TypeError, ValueError, OSError) as error:

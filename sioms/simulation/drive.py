@@ -47,7 +47,7 @@ class Mover:
         return self.shoved or self.velocity
 
     def count_from(self, position: float) -> None:
-        """Call the present place a position: the ends of the machine stay where they are."""
+        """Preset the position counter here; the mechanical ends stay where they are."""
         shift = position - self.position - self.slip
         self.origin -= shift
         self.low += shift

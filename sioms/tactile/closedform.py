@@ -66,7 +66,7 @@ def wedge_width(cylinder: Cylinder, load: float, half_angle: float) -> float:
     _check_press("take wedge width", load)
     if not 0.0 < half_angle < 0.5 * np.pi:
         raise ValueError(
-            f"take wedge width: half angle is {half_angle} rad; need between 0 and pi/2, measured from its axis"
+            f"compute wedge width: half angle is {half_angle} rad; want between 0 and pi/2, measured from its axis"
         )
     return float(load * (1.0 - cylinder.poisson) * np.tan(half_angle) / (cylinder.shear_pa * cylinder.outer_m))
 

@@ -78,10 +78,10 @@ def test_bad_replies(data: bytes, error: type[Exception], words: str) -> None:
 
 def test_what_cannot_be_a_reply() -> None:
     for data in (b"\xff\xff\xfd\x00\x01\xff\xff", b"\xff\xff\xfd\x00\x01\x01\x00", bytes(2050)):
-        with pytest.raises(LinkError, match="is right"):
+        with pytest.raises(LinkError, match="want "):
             BUS.ping(1).want(data)
     for value, size in ((256, 1), (-1, 1), (70000, 2), (-40000, 2), (1 << 32, 4)):
-        with pytest.raises(ValueError, match="is right"):
+        with pytest.raises(ValueError, match="want "):
             dxl.little(value, size)
 
 

@@ -67,7 +67,7 @@ def test_rdt_request_and_record() -> None:
     exchange = rdt.start(rdt.Command.BUFFERED, 0.1)
     assert exchange.repeatable
     assert feed(exchange, record + record, 72) == expected == feed(exchange, record, 36)
-    with pytest.raises(LinkError, match="10 bytes came, which are no records"):
+    with pytest.raises(LinkError, match="10 bytes received; want records"):
         feed(exchange, record[:10], 10)
 
 
@@ -160,9 +160,9 @@ def test_a_page_by_length_and_by_the_end_of_the_connection(step: int) -> None:
     for reply, words in (
         (with_length[:-1], "cut after 53 of 54 bytes"),
         (b"HTTP/1.0 404 Not Found\r\n\r\n", "answers 404; is it another device"),
-        (b"SSH-2.0-OpenSSH_9.2\r\n", "no answer of a web server"),
-        (b"HTTP/1.0 200 OK\r\nHalf: he", "no answer of a web server"),
-        (b"", "0 bytes that are no answer"),
+        (b"SSH-2.0-OpenSSH_9.2\r\n", "not the reply of a web server"),
+        (b"HTTP/1.0 200 OK\r\nHalf: he", "not the reply of a web server"),
+        (b"", "0 bytes that are not the reply"),
     ):
         with pytest.raises(LinkError, match=words):
             exchange.decode(reply)
@@ -194,8 +194,8 @@ def test_schunk_commands() -> None:
     [
         ("ff ff 01 00 02 00 40 05", DeviceError, "start: the sensor answers error 05, not while it streams"),
         ("ff ff 01 00 02 00 40 77", DeviceError, "error 77, unknown error"),
-        ("ff ff 01 00 02 00 41 00", LinkError, "41 00 is none to command 40"),
-        ("ff ff 01 00 01 00 40", LinkError, "40 is none to command 40"),
+        ("ff ff 01 00 02 00 41 00", LinkError, "41 00 does not answer command 40"),
+        ("ff ff 01 00 01 00 40", LinkError, "40 does not answer command 40"),
         ("48 54 54 50 2f 31 2e 31", LinkError, "48 54 54 50 2f 31 begins no reply of this sensor"),
         ("ff ff 01 00 ff ff 40 00", LinkError, "begins no reply"),
     ],

@@ -23,13 +23,13 @@ BAD: list[tuple[Callable[[Any], Any], bytes, str]] = [
     (toml_of, b"x = 99999999999999999999", "x: an integer of more than 64 bits"),
     (toml_of, b"[a]\nx = [{ y = 1979-05-27 }]", r"a\.x\[0\]\.y = 1979-05-27: a date; want"),
     (toml_of, b"x = 1\nx = 2", "overwrite"),
-    (toml_of, b"x = \xff", "no text in UTF-8 .byte 4 is 0xff"),
+    (toml_of, b"x = \xff", "not text in UTF-8 .byte 4 is 0xff"),
     (json_of, b"[" * 100_000, "nested too deep"),
     (json_of, b"[" * 50 + b"]" * 50, "nested deeper"),
     (json_of, b'{"a": ' + b"9" * 5000 + b"}", "digits"),
     (json_of, b'{"a": 99999999999999999999}', "a: an integer of more than 64 bits"),
     (json_of, b"", "Expecting value"),
-    (json_of, b"\xff\xfe", "no text in UTF-8"),
+    (json_of, b"\xff\xfe", "not text in UTF-8"),
 ]
 
 

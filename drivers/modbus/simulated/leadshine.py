@@ -174,7 +174,7 @@ class Drive:
                 pulses = round(value)
                 self.write(16, 0x6200, [1, pulses >> 16 & 0xFFFF, pulses & 0xFFFF, 100, 100, 100, 0, 0x10])
             case _:
-                raise ValueError(f"kind {kind}: velocity or position is right")
+                raise ValueError(f"kind {kind}: want velocity or position")
 
     def shove(self, velocity: float) -> None:
         """Turn by itself [pulses/s]."""

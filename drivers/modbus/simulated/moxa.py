@@ -91,7 +91,7 @@ class Block:
     def foreign(self, kind: str, value: float) -> None:
         """Set the outputs, as another master would."""
         if kind != "output":
-            raise ValueError(f"kind {kind}: output is right")
+            raise ValueError(f"kind {kind}: want output")
         self.due()
         if not self.alarm:
             self._write_outputs(0, [int(value) >> i & 1 for i in range(self.outputs)])

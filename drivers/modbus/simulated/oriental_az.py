@@ -105,7 +105,7 @@ class Drive:
         self.time.catch_up()
         kinds = {"velocity": (16, 0, value), "position": (1, value, 1000.0)}
         if kind not in kinds:
-            raise ValueError(f"kind {kind}: velocity or position is right")
+            raise ValueError(f"kind {kind}: want velocity or position")
         what, position, speed = kinds[kind]
         pairs = [0, what, round(position), round(speed), 100_000, 100_000, 1000, 1]
         words = [word for pair in pairs for word in (pair >> 16 & 0xFFFF, pair & 0xFFFF)]

@@ -132,7 +132,7 @@ class Coupler:
     def foreign(self, kind: str, value: float) -> None:
         """Set the outputs, as another master would."""
         if kind != "output":
-            raise ValueError(f"kind {kind}: output is right")
+            raise ValueError(f"kind {kind}: want output")
         self.due()
         if self.status != EXPIRED:
             self.set_outputs(0, [int(value) >> i & 1 for i in range(len(self.do))])

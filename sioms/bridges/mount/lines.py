@@ -144,7 +144,7 @@ def _axis(word: str, info: NodeInfo) -> int:
 
 def _whole(value: float) -> int:
     if not -(1 << 53) <= value <= 1 << 53 or value != int(value):
-        raise ValueError(f"{value:g}; want whole numbers for bits")
+        raise ValueError(f"{value:g}; want integers for bits")
     return int(value)
 
 

@@ -92,7 +92,7 @@ class Patience:
                 except TimeoutError:
                     if left_s <= 0 or over():
                         raise
-        raise OSError(errno.EINTR, "interrupted while it waited")
+        raise OSError(errno.EINTR, "interrupted while waiting")
 
 
 class NodeFile:

@@ -96,7 +96,7 @@ def _say(text: str) -> None:
 
 
 def alarm(recorder: Recorder, text: str) -> None:
-    """Say in the daemon's log and status that something is wrong."""
+    """Report a problem in the daemon's log and status."""
     try:
         if recorder.cell is not None:
             recorder.cell.report("error", text)

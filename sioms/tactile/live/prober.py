@@ -100,7 +100,7 @@ class Recorder:
             self._columns[name].append(value)
 
     def take_felt_loads(self) -> None:
-        """Put the load that the force sensor felt in the place of the wanted one, where nothing else tells the load."""
+        """Replace the commanded load by the measured one where no load cell gives it."""
         force, touch, phase = (np.concatenate(self._columns[n]) for n in ("force", "touch", "phase"))
         for i, t in enumerate(self.touches):
             before, under = (force[(touch == i) & (phase == p)].mean() for p in (0, 1))

@@ -121,7 +121,7 @@ def test_a_daemon_without_a_lock_is_left_alone(path: str) -> None:
 def test_a_folder_that_others_may_write_to_is_refused(path: str) -> None:
     folder = os.path.dirname(path)
     os.chmod(folder, 0o777)
-    refused(path, errno.EPERM, f"{re.escape(folder)}: others may write to it, who could replace the socket of")
+    refused(path, errno.EPERM, f"{re.escape(folder)}: others may write to it, who could replace the socket in")
     if os.geteuid() == 0:
         os.chown(folder, -1, 4242)  # the group of who knows whom
         os.chmod(folder, 0o775)

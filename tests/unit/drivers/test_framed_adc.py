@@ -207,7 +207,7 @@ def test_another_device_is_refused(table: dict[str, Any], words: str) -> None:
         ({"names": ["a"]}, "names: 1 for 16 channels"),
         ({"scale": [1.0]}, "scale: 1 for 16 channels"),
         ({"scale": 0.0}, "scale = 0.0; want finite numbers, not 0"),
-        ({"format": "i8"}, "format = i8; one of i16, i32, f32 is right"),
+        ({"format": "i8"}, "format = i8; want one of i16, i32, f32"),
         ({"rate_hz": 0}, "rate_hz = 0"),
     ],
 )

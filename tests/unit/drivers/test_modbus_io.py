@@ -86,7 +86,7 @@ class TestIo:
         ("change", "words"),
         [
             ({"model": "E1122"}, "not in the map; did you mean E1"),
-            ({"model": ""}, "model: none given; one of E1210"),
+            ({"model": ""}, "model: none given; want one of E1210"),
             ({"model": "", "channels": {"dii": 4}}, "channels.dii: no such port; did you mean di"),
             ({"channels": {"di": 40}}, "channels.di = 40; want 0 to 16"),
             ({"safe": {"di": 1}}, "safe.di: no output of this device"),

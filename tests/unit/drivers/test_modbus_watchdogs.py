@@ -48,7 +48,7 @@ def test_the_watchdog_runs_behind_every_opening() -> None:
 def test_a_watchdog_that_does_not_run_is_no_opening(monkeypatch: pytest.MonkeyPatch) -> None:
     joined = coupler()
     monkeypatch.setattr(wago, "TRIGGER", 0x1010)  # a coupler whose trigger is elsewhere
-    with pytest.raises(DeviceError, match="set the watchdog of io0: watchdog_status is 0; 1 is right"):
+    with pytest.raises(DeviceError, match="set the watchdog of io0: watchdog_status is 0; want 1"):
         joined.open()
 
 
@@ -58,7 +58,7 @@ def test_a_time_that_was_not_taken_is_no_opening(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(
         joined.device, "_write_watchdog", lambda at, value: write(at, 100 if at == wago.TIME else value)
     )
-    with pytest.raises(DeviceError, match=r"watchdog_time is 10; 1\.5 is right"):
+    with pytest.raises(DeviceError, match=r"watchdog_time is 10; want 1\.5"):
         joined.open()
 
 

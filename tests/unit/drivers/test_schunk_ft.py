@@ -108,7 +108,7 @@ def test_replies_are_numbered_by_the_box() -> None:
         rig.go(0.01)
     assert len(rig.published) > 20
     rig.side_line = lambda data: b"\xff\xff\x07\x00\x02\x00\x12\x00"
-    with pytest.raises(LinkError, match="stop: the reply 12 00 is none to command 41"):
+    with pytest.raises(LinkError, match="stop: the reply 12 00 does not answer command 41"):
         rig.do(rig.driver.open())
 
 
@@ -223,7 +223,7 @@ def test_refusals_and_other_masters() -> None:
 def test_another_sensor_is_refused() -> None:
     for table, parameter, value, words in (
         ({"product": "FTN"}, (1, 0), b"KMS", "calls itself 'KMS'; the configuration says 'FTN'"),
-        ({}, (0x50, 0), b"\x01", "has unit selection 1; N and N\\*m, 0, are right"),
+        ({}, (0x50, 0), b"\x01", "has unit selection 1; want 0 \\(N and N\\*m\\)"),
     ):
         rig = SchunkRig(**table)
         rig.device.parameters[parameter] = value

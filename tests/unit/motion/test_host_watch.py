@@ -50,7 +50,7 @@ def test_motion_that_nobody_commanded_is_a_fault(velocity):
     rig = rest()
     rig.shove[0] = velocity
     assert rig.ticks_to_fault() <= 30 + 1000 * 0.02 / abs(velocity)
-    assert "axis x moves though nothing was commanded" in rig.text and "0.02 m is right" in rig.text
+    assert "axis x moves though nothing was commanded" in rig.text and "0.02 m is allowed" in rig.text
     assert rig.field("force") == 0.0 and not rig.field("status") & S.POSITION_LOST
     other = rest(watch=Watch(uncommanded=False))
     other.shove[0] = velocity
@@ -136,7 +136,7 @@ def test_each_axis_is_judged_by_itself():
     rig.shove[:] = 0.1
     rig.tick(100)
     assert rig.field("status", 0) & S.FAULT and not rig.field("status", 1) & S.FAULT
-    assert "0.001 m is right" in rig.text
+    assert "0.001 m is allowed" in rig.text
 
 
 class Delayed(Shoved):

@@ -41,7 +41,7 @@ def test_motion_that_nobody_commanded_is_a_fault_within_a_few_polls(velocity):
     stops = len(cell.drives[0].log)
     cell.drives[0].shove = velocity
     assert cell.polls_to_fault() <= (4 if abs(velocity) >= FAST else 8)
-    assert ("axis x moves" in cell.text and "0.02 m is right" in cell.text) or "axis x moves at" in cell.text
+    assert ("axis x moves" in cell.text and "0.02 m is allowed" in cell.text) or "axis x moves at" in cell.text
     assert cell.drives[0].log[stops:] == [ActionKind.QUICK_STOP]
     assert not cell.status() & S.POSITION_LOST
 

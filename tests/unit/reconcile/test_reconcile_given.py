@@ -31,7 +31,7 @@ LOADS = (
 
 @pytest.mark.parametrize(
     ("text", "says"),
-    [(b"[axis", "read x: "), (b"name = \xff", "read x: it is no text in UTF-8")],
+    [(b"[axis", "read x: "), (b"name = \xff", "read x: it is not text in UTF-8")],
 )
 def test_a_file_that_is_no_toml_says_so(text: bytes, says: str) -> None:
     with pytest.raises(BadInputError, match=says):

@@ -139,7 +139,7 @@ def test_readings_are_si() -> None:
             "position 1e.06 is 1e.12 pulse in the register",
         ),
         (LEADSHINE, {"position": 0.0, "speed": 1e-5, **RAMP}, "speed 1e-05 is 0 rpm .* takes 1 to 6000"),
-        (LEADSHINE, {"position": 0.0, "speed": 2.0, **RAMP}, "0.000166667 to 1 is right"),
+        (LEADSHINE, {"position": 0.0, "speed": 2.0, **RAMP}, "want 0.000166667 to 1"),
         (
             LEADSHINE,
             {"position": 0.0, "speed": 0.1, "acceleration": 0.0, "deceleration": 1.0},

@@ -57,7 +57,7 @@ ITEM = "commands/position/writes/0/items/2"
             "inside signals.position (0x1002 to 0x1003 of the holding table)",
         ),
         ("signals/position/address", 0xFFFF, "address 0xffff with 2 places leaves 0 to 0xffff"),
-        ("signals/position/scale", 0, "signals.position: scale is 0; another number is right"),
+        ("signals/position/scale", 0, "signals.position: scale is 0; want another number"),
         ("signals/name", {"address": 0x100, "type": "text"}, "signals.name: a text needs words"),
         ("signals/big", {"address": 0x8000, "count": 126}, "126 places; one message reads at most 125"),
         ("poll/allways", ["status"], "poll.allways: unknown group; did you mean always"),
@@ -66,7 +66,7 @@ ITEM = "commands/position/writes/0/items/2"
         ("identify/0", {"signal": "status"}, "identify[0]: tests nothing"),
         ("axis/modes", ["POSITON"], "axis.modes: unknown mode POSITON; did you mean POSITION"),
         ("axis/modes", ["FORCE"], "axis.modes: FORCE needs commands.force"),
-        ("axis/status/moving", {"signal": "status", "bit": 16}, "bit 16 of status; 0 to 15 is right"),
+        ("axis/status/moving", {"signal": "status", "bit": 16}, "bit 16 of status; want 0 to 15"),
         ("axis/status", {}, "neither moving nor done"),
         ("commands/stop/repeat", False, "commands.stop: repeat is false; a stop must be repeatable"),
         (
@@ -78,9 +78,9 @@ ITEM = "commands/position/writes/0/items/2"
         (
             "commands/home/writes/0/items/0/value",
             70000,
-            "70000 does not fit a register of type u16; 0 to 65535",
+            "70000 does not fit a register of type u16; want 0 to 65535",
         ),
-        ("commands/home/writes/0/items/0/source", "speed", "has both value and source; exactly one is right"),
+        ("commands/home/writes/0/items/0/source", "speed", "has both value and source; want exactly one"),
         ("commands/home/writes/0/items/0", {}, "has neither value nor source"),
         (
             "commands/home/writes/0/items/0",
@@ -90,16 +90,16 @@ ITEM = "commands/position/writes/0/items/2"
         (
             "commands/home/writes/0/items/0",
             {"values": [1, 1], "differs_from": "status"},
-            "values are [1, 1]; two that differ are right",
+            "values are [1, 1]; want two that differ",
         ),
         ("commands/home/writes/0/items/0", {"values": [1, 2]}, "values without differs_from"),
-        ("commands/home/writes/0/items/0/values", [1, 2], "has both value and values; exactly one is right"),
+        ("commands/home/writes/0/items/0/values", [1, 2], "has both value and values; want exactly one"),
         (
             "commands/watchdog",
             {"writes": [{"address": 1, "items": [{"source": "timeout", "unit": "s"}]}]},
             "dead_man.proof: missing; what commands.watchdog sets must be read back",
         ),
-        ("dead_man/proof", [{"signal": "status"}], "dead_man.proof[0]: tests nothing; equals"),
+        ("dead_man/proof", [{"signal": "status"}], "dead_man.proof[0]: tests nothing; want equals"),
         (
             "dead_man/proof",
             [{"signal": "statu", "equals": 1}],
@@ -108,7 +108,7 @@ ITEM = "commands/position/writes/0/items/2"
         (
             "dead_man/proof",
             [{"signal": "status", "source": "speed"}],
-            "dead_man.proof[0]: unknown quantity speed; timeout is right",
+            "dead_man.proof[0]: unknown quantity speed; want timeout",
         ),
         (
             "dead_man/tripped",
@@ -119,22 +119,22 @@ ITEM = "commands/position/writes/0/items/2"
         (
             "restart/token",
             "",
-            "restart.token: needs commands.token, which writes it; both or neither is right",
+            "restart.token: needs commands.token, which writes it; want both or neither",
         ),
-        ("restart/maximum", 1, "restart: the token is 1 to 1; a wider range is right"),
+        ("restart/maximum", 1, "restart: the token is 1 to 1; want a wider range"),
         (
             "commands/home/writes/0/items",
             [{"type": "u32", "value": 1}],
             "function single writes one register, not 2",
         ),
         (f"{ITEM}/source", "sped", "unknown quantity sped; did you mean speed"),
-        (f"{ITEM}/unit", "pulse", "speed cannot be in 'pulse'; one of rpm, pulse/s is right"),
+        (f"{ITEM}/unit", "pulse", "speed cannot be in 'pulse'; want one of rpm, pulse/s"),
         (f"{ITEM}/maximum", 70000, "maximum 70000 does not fit type u16"),
         ("dead_man/refresh", ["jog"], "dead_man.refresh: unknown command jog"),
-        ("dead_man/timeout_s", 0.0, "dead_man.timeout_s: is 0.0 s; more than 0 is right"),
+        ("dead_man/timeout_s", 0.0, "dead_man.timeout_s: is 0.0 s; want more than 0"),
         ("alarms/codes/high", "x", "alarms.codes: 'high' is not a number"),
         ("alarms/signal", "alarms", "alarms: unknown signal alarms; did you mean alarm"),
-        ("ports/do", {"signal": "enable", "node_class": "binary"}, "coil or discrete is right"),
+        ("ports/do", {"signal": "enable", "node_class": "binary"}, "want coil or discrete"),
         ("modells", {}, "modells: unknown key; did you mean models"),
     ],
 )

@@ -33,7 +33,7 @@ def test_a_driver_names_its_rig() -> None:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"simulators": []}, "unknown key simulators; one of driver, tables"),
+        ({"simulators": []}, "unknown key simulators; want one of driver, tables"),
         ({"tcp": "yes"}, "tcp"),
         ({"axes": [{}]}, "node"),
     ],

@@ -292,7 +292,7 @@ def test_faults_hold_for_their_count() -> None:
     once = faults.outgoing(b"abcdef")[1]
     assert len(once) == 3 and faults.outgoing(b"abcdef") == (0.0, b"abcdef")
     assert obey("late 0.5 1", handlers) == "ok" and faults.outgoing(b"a") == (0.5, b"a")
-    assert obey("nois", handlers).startswith("error unknown command nois; one of")
+    assert obey("nois", handlers).startswith("error unknown command nois; want one of")
     assert obey("cut x", handlers).startswith("error cut: ")
     obey("deaf", handlers)
     assert not faults.hears() and not faults.hears()

@@ -111,7 +111,7 @@ def test_a_file_is_read_up_to_where_it_was_cut(tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("hello\n", "is this a trace"),
-        ('{"sioms_trace":7}\n', "version 7 of the format; 1 is right"),
+        ('{"sioms_trace":7}\n', "version 7 of the format; want 1"),
         (json.dumps(HEADER) + '\n{"t":1}\n', "line 2"),
         (json.dumps(HEADER) + '\n{"t":1,"n":0,"d":">","b":"xy"}\n', "line 2"),
     ],
