@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.course import Course, estimate
 from sioms.reconcile.effect import Array
 from sioms.reconcile.thresholds import EARNED, GAIN, REGULAR, SECOND, SURE
-from sioms.reconcile.windows import NUMBERS, Number, Read, View
+from sioms.reconcile.windows import NUMBERS, Number, Products, Read, View
 
 ROUNDS, LEVELLED = 20, 3
 SAID = 4  # spans of a record
@@ -127,6 +127,29 @@ class _Sized:
         return np.stack([view.column(record, p, s) for p, s in zip(self.parts, self.sizes, strict=True)], axis=1)
 
 
+class _Trials:
+    """Squares that switches leave beside numbers of given sizes; only records whose switches are new are looked at."""
+
+    def __init__(self, view: View, sized: _Sized) -> None:
+        """Look at what the numbers do in every record."""
+        self.view = view
+        self.forces = [sized.columns(view, i) for i in range(len(view.records))]
+        self.steady = [view.answer(i, b) for i, b in enumerate(self.forces)]
+        self.known: dict[tuple[int, bool, tuple[int, ...]], Products] = {}
+
+    def left(self, switches: Switches) -> float:
+        """Return the squares that are left."""
+        every = enumerate(zip(switches.first, switches.edges, strict=True))
+        return self.view.left([self._products(i, switches, (i, *key)) for i, key in every])
+
+    def _products(self, i: int, switches: Switches, key: tuple[int, bool, tuple[int, ...]]) -> Products:
+        if key not in self.known:
+            b = self.forces[i]
+            on = self.view.answer(i, b * switches.on(i, len(b))[:, None])
+            self.known[key] = self.view.products(i, np.concatenate([self.steady[i], on], axis=1))
+        return self.known[key]
+
+
 def switching(view: View, number: Number, read: Read) -> Course | None:
     """Fit two values of a number, and of a second one that switches with it where that says much more."""
     switches = _settled(view, [number], _two_values(view, read))
@@ -206,8 +229,8 @@ def _settled(view: View, parts: Sequence[Number], switches: Switches) -> Switche
     """
     if not switches.any():
         return switches
-    best = _Sized.of(view, parts, switches)
-    left, step, ends = best.left, 4 * view.window, [s.stop for s in view.spans]
+    trials = _Trials(view, _Sized.of(view, parts, switches))
+    left, step, ends = trials.left(switches), 4 * view.window, [s.stop for s in view.spans]
     while step >= 1:
         for i, k, to in list(switches.moved(step, ends)):
             own = switches.edges[i]
@@ -215,14 +238,14 @@ def _settled(view: View, parts: Sequence[Number], switches: Switches) -> Switche
             if edges != tuple(sorted({*edges})):
                 continue
             trial = switches.put(i, edges, switches.first[i])
-            if (cost := _Sized.of(view, parts, trial, best.sizes).left) < left:
+            if (cost := trials.left(trial)) < left:
                 left, switches = cost, trial
         step //= 2
-    while trials := list(switches.fewer()):
-        costs = [_Sized.of(view, parts, t, best.sizes).left for t in trials]
+    while fewer := list(switches.fewer()):
+        costs = [trials.left(t) for t in fewer]
         if min(costs) > left / (1.0 - GAIN):
             break
-        left, switches = min(left, *costs), trials[int(np.argmin(costs))]
+        left, switches = min(left, *costs), fewer[int(np.argmin(costs))]
     return switches
 
 

@@ -17,6 +17,8 @@ from sioms.reconcile.simulate import inertia, linked, pack
 
 #: Shortest window, and most of them.
 WINDOW_S, MOST_WINDOWS = 0.1, 160
+#: What keeps columns apart that are nearly the same.
+RIDGE = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,12 +86,24 @@ class Read:
     left: float
 
 
+@dataclass(frozen=True, slots=True)
+class Products:
+    """What columns of one record, shape (n, k), have to do with each other, with numbers of the model, and with what
+    is left: shapes (k, k), (numbers, k) and (k,).
+    """
+
+    own: Array
+    model: Array
+    rest: Array
+
+
 class View:
     """What a fit leaves; its rows are those of the residual, thinned.
 
     Attributes:
         rest: beside what the numbers of the model could make up for, shape (rows,).
         cuts: ends of the windows of every record, in samples.
+        parts: rows of every record.
     """
 
     def __init__(self, problem: Problem, fit: Fit, forces: Sequence[Array] = ()) -> None:
@@ -108,6 +122,8 @@ class View:
         self.rows = np.concatenate(
             [a + np.arange(0, len(s), self.step) for a, s in zip(first, self.spans, strict=False)]
         )
+        ends = np.cumsum([0, *(len(range(0, len(s), self.step)) for s in self.spans)]).tolist()
+        self.parts = [slice(a, b) for a, b in pairwise(ends)]
         self.seen = _seen(problem, fit, bool(forces))
         self.factors = np.broadcast_to(problem.factors, len(fit.residual))[self.rows]
         self.q = orthonormal(fit.jacobian[self.rows])
@@ -142,12 +158,27 @@ class View:
         """
         f = self._beside(columns * self.factors[:, None])
         scale = np.maximum(np.linalg.norm(f, axis=0), 1e-300)
-        gram = (f / scale).T @ (f / scale) + 1e-6 * np.eye(f.shape[1])
+        gram = (f / scale).T @ (f / scale) + RIDGE * np.eye(f.shape[1])
         size = np.linalg.solve(gram, (f / scale).T @ self.rest)
         rest = self.rest - (f / scale) @ size
         left = float(rest @ rest)
         spread = np.sqrt(np.diag(np.linalg.inv(gram)) * left / effective_samples(rest))
         return size / scale, spread / scale, left
+
+    def products(self, record: int, columns: Array) -> Products:
+        """Multiply columns of the rows of one record, shape (n, k), out."""
+        part = self.parts[record]
+        f = columns * self.factors[part][:, None]
+        return Products(f.T @ f, self.q[part].T @ f, f.T @ self.rest[part])
+
+    def left(self, products: Sequence[Products]) -> float:
+        """Return the squares that a fit leaves, as ``fitted`` does, from the products of all records."""
+        own, model, rest = (np.sum([getattr(p, name) for p in products], axis=0) for name in ("own", "model", "rest"))
+        gram = own - model.T @ model
+        scale = np.sqrt(np.maximum(np.diag(gram), 1e-300))
+        gram, toward = gram / np.outer(scale, scale), rest / scale
+        size = np.linalg.solve(gram + RIDGE * np.eye(len(gram)), toward)
+        return float(self.rest @ self.rest - 2.0 * size @ toward + size @ gram @ size)
 
     def above(self, squares: float) -> float:
         """Squares above what noise leaves."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sioms.reconcile.fit import Fit, Problem
+from sioms.reconcile.fit import Fit, Problem, refit
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer
 from sioms.reconcile.plausible import physical, small
@@ -15,9 +15,9 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.report.words import span
 from sioms.reconcile.scale import check_scale
 from sioms.reconcile.simulate import simulate
-from sioms.reconcile.switches import Switches
+from sioms.reconcile.switches import Switches, _Sized, _Trials
 from sioms.reconcile.verdict import Estimate
-from sioms.reconcile.windows import NUMBERS, Seen
+from sioms.reconcile.windows import NUMBERS, Seen, View
 
 AXIS = AxisModel(
     True, 1e-3, 2e-3, 1e-3, 2e-5, 2 * np.pi, 0.7, 20.0, Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
@@ -104,3 +104,17 @@ def test_an_interval_has_the_digits_that_show_it(value: float, half: float, said
     shown = span(Estimate("Fc", value, value - half, value + half, "N", ""))
     assert tuple(map(float, shown)) == pytest.approx(tuple(map(float, said)), rel=1e-9)
     assert len(set(shown)) == 3
+
+
+def test_trials_of_switches_leave_what_a_fit_of_all_columns_leaves() -> None:
+    """The products of each record add up to the fit; records whose switches are as before are not looked at again."""
+    runs = [recorded(AXIS.with_effect("coulomb", {"Fc": level})).session.records[0] for level in (0.05, 0.03)]
+    problem = Problem(Session(tuple(replace(r, name=str(i)) for i, r in enumerate(runs))), observer(AXIS, 1e-5, 2e-3))
+    view = View(problem, refit(problem, AXIS.with_effect("viscous", {"b_extra": 1e-3})))
+    dry = next(n for n in NUMBERS if n.symbol == "Fc")
+    switches = Switches((False, True), ((900, 1700), (1200,)))
+    sized = _Sized.of(view, [dry], switches)
+    trials = _Trials(view, sized)
+    for trial in (switches, switches.put(1, (1300,), True), switches.put(0, (), False)):
+        assert trials.left(trial) == pytest.approx(_Sized.of(view, [dry], trial, sized.sizes).left, rel=1e-6)
+    assert len(trials.known) == 4
