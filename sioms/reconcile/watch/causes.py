@@ -162,14 +162,30 @@ def _without_loads(normal: Normal, change: Array, cover: Array) -> tuple[Array, 
 def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -> bool:
     """Say whether a shift of the reference's edges cannot be play: by which flank bears at each, play shifts them, too.
 
-    The mass behind so large a play would show at reversals of force; what is too small for that is not told apart.
+    A play that does it is at least twice the shift, and the mass behind it would show at reversals of force. Every size
+    from there on is tried by itself: of all sizes at once only their sum shows, and what is too small to show in it
+    hides the rest. What is too small for any column is not told apart.
     """
     spread = max(normal.edges, default=0.0) - min(normal.edges, default=0.0)
-    gap = 2.0 * max(abs(float(change[PLACE])), abs(float(change[SCALE])) * spread)
+    gap = 2.0 * max(abs(float(change[PLACE])), abs(float(change[SCALE])) * spread) / travel
+    if gap <= SMALLEST * PLAYS[0]:
+        return False
     plays = slice(GAP, GAP + len(PLAYS))
-    behind = float(np.sum(change[plays]))
-    sure = float(np.sqrt(np.sum((now.noise + normal.own)[plays, plays])))
-    return gap > SMALLEST * PLAYS[0] * travel and behind + 2.0 * sure < BEHIND * abs(float(normal.theta[MASS]))
+    information = np.linalg.inv((now.noise + normal.own)[plays, plays])
+    least = BEHIND * abs(float(normal.theta[MASS]))
+    for way in _sizes(gap):
+        known = float(way @ information @ way)
+        behind = float(way @ information @ change[plays]) / known
+        if behind + 2.0 / np.sqrt(known) >= least:
+            return False
+    return True
+
+
+def _sizes(gap: float) -> list[Array]:
+    """Return how a mass behind a play shows in the columns of play: of that size [of the travel], and of each above."""
+    at = float(np.interp(np.log(gap), np.log(PLAYS), np.arange(len(PLAYS))))
+    places = [at, *range(int(at) + 1, len(PLAYS))]
+    return [np.interp(np.arange(len(PLAYS)), [p - 1.0, p, p + 1.0], [0.0, 1.0, 0.0]) for p in places]
 
 
 def _fit(cause: Cause, theta: Array, change: Array, cover: Array) -> tuple[float, Array, Array]:

@@ -15,7 +15,7 @@ from sioms.reconcile.watch.keep import packed, restore
 from sioms.reconcile.watch.moves import Cutter, Samples
 from sioms.reconcile.watch.normal import ALL_NAMES, TOTAL, Estimate, Normal
 from sioms.reconcile.watch.propose import Gains, margin
-from sioms.reconcile.watch.rows import CONSTANT, DRY, MASS, PLAYS, SIZE, VISCOUS, kernels, rows_of, wind_up
+from sioms.reconcile.watch.rows import CONSTANT, DRY, GAP, MASS, PLAYS, SIZE, VISCOUS, kernels, rows_of, wind_up
 
 TICK_S = 0.001
 ABOUT = About("mod0.xaxis", False, TICK_S, 100.0, 0.4, 1e-6, 0.5)
@@ -144,6 +144,22 @@ def test_what_does_not_separate_is_left_open_and_what_is_unknown_unnamed() -> No
     assert odd.is_drift and odd.names == ()
     carried = replace(normal(), loads=True, least=2.0, most=2.6)
     assert not judge(carried, now(mass=0.5), 0.4).is_drift, "loads of that mass are usual there"
+
+
+def unsure_of_small_play(base: Normal) -> Normal:
+    """The same axis, in whose moves the smallest column of play hardly shows; its reference is of micrometres."""
+    own = base.own.copy()
+    own[GAP, GAP], own[SIZE, SIZE] = 4.0, 1e-12
+    return replace(base, own=own)
+
+
+def test_a_place_is_told_though_the_smallest_play_would_not_show() -> None:
+    """A shift by half a millimetre would take a play of a millimetre, which would show in the largest column."""
+    was = unsure_of_small_play(normal())
+    assert judge(was, now(place=5e-4), 0.4).names == ("place",)
+    half_seen = replace(now(place=5e-4), noise=now().noise + np.diag(np.eye(TOTAL)[GAP + 2]))
+    assert "backlash" in judge(was, half_seen, 0.4).names, "a mass behind that play cannot be excluded"
+    assert "backlash" in judge(was, now(place=2e-5), 0.4).names, "so small a play shows in no column"
 
 
 def test_the_state_comes_back_and_damaged_state_is_left_out() -> None:
