@@ -18,6 +18,7 @@ from sioms.reconcile.changes import change, settled
 from sioms.reconcile.channels import with_resolution
 from sioms.reconcile.conclude import Searched, conclude
 from sioms.reconcile.effects import known
+from sioms.reconcile.effects.smooth import LAWS
 from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
@@ -151,8 +152,10 @@ def _explained(ready: Prepared, o: Options) -> Searched:
         o.progress(f"a smoother explains {100 * share:.0f} % of what remains: searching for a term")
         before = found
         found = _run_with_terms(searcher, ready.model)
-        rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
         share = smoother_share(ready.problem, found.fit)
+        if found.fit.ratio > AXIS.odd and share > UNEXPLAINED:
+            found, share = _by_laws(searcher, ready, found, share, o)
+        rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
     elif (
         found.fit.ratio > LOUD
         and not rattles(found.fit.model)
@@ -203,6 +206,20 @@ def warm(model: AxisModel) -> bool:
     return any(known()[n].mechanism.warms for n in model.effects)
 
 
+def _by_laws(searcher: Searcher, ready: Prepared, found: Found, share: float, o: Options) -> tuple[Found, float]:
+    """Search with smooth laws too, where no formula is enough; they stand where they clearly save more."""
+    o.progress(f"a smoother explains {100 * share:.0f} % of what the best formula leaves: searching for a law")
+    other = _run_with_terms(searcher, ready.model, _laws(ready.model))
+    gain, sure = better(other.losses, searcher.loss(searcher.fit(found.fit.model)))
+    if gain > SPECIFIC and sure > SURE:
+        return other, smoother_share(ready.problem, other.fit)
+    return found, share
+
+
+def _laws(model: AxisModel) -> tuple[str, ...]:
+    return tuple(t.name for t in LAWS if model.applicable(t))
+
+
 def _terms(model: AxisModel) -> tuple[str, ...]:
     return tuple(t.name for t in TERMS if model.applicable(t))
 
@@ -217,10 +234,10 @@ def _promising(searcher: Searcher, model: AxisModel, found: Found) -> bool:
     return min(left, default=np.inf) < (1.0 - 0.5 * SPECIFIC) * found.fit.cost
 
 
-def _run_with_terms(searcher: Searcher, model: AxisModel) -> Found:
-    """Search anew with nameless terms beside the library."""
+def _run_with_terms(searcher: Searcher, model: AxisModel, laws: tuple[str, ...] = ()) -> Found:
+    """Search anew with nameless terms, and smooth laws, beside the library."""
     names = searcher.names
-    searcher.names = names + _terms(model)
+    searcher.names = names + _terms(model) + laws
     found = searcher.run(model)
     searcher.names = names
     return found

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 
 #: Begins the name of a nameless term, of axes and sensors alike.
 TERM_PREFIX = "term_"
-#: Width of a parameter row handed to a state function; the last place holds 2 pi / pitch.
-ROW = 8
-TURN = ROW - 1
+#: Width of a parameter row handed to a state function; place TURN holds 2 pi / pitch, an eighth number and further ones
+#: come after it.
+ROW = 11
+TURN = 7
 
 Array = NDArray[np.float64]
 #: A float in the compiled time step, an array of axes in a vectorised plant.
@@ -114,10 +115,19 @@ class Trials:
 NONE = Mechanism()
 
 
+class Over(Enum):
+    """The variable over which a law without a name is laid, by its name in a motion."""
+
+    PLACE = "x"
+    SPEED = "v"
+    FORCE = "u"
+
+
 class Ref(Enum):
     """The natural size of a parameter on a given axis; bounds and starts are multiples of it."""
 
     ONE = "1"
+    PER_FORCE = "1 / rated force"
     FORCE = "rated force"
     INERTIA = "nominal inertia"
     DAMPING = "rated force / largest speed"
@@ -202,6 +212,8 @@ class Effect(AnyEffect):
         rotary, linear: kinds of axis on which it makes sense.
         joins: effects of which this one is both at once: it is tried where one of them is in the model already.
         beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
+        over: of a law that is laid over what the records show of a variable: which; its last two parameters are the
+            middle and the step of its places.
         takes: (symbol, symbol): in the place of a look-alike that has the second number, the first is that.
         ratios: (symbol, symbol, most): the first number is at most so many times the second.
     """
@@ -211,6 +223,7 @@ class Effect(AnyEffect):
     function: StateFunction | None = None
     mechanism: Mechanism = NONE
     trials: Trials | None = None
+    over: Over | None = None
     sized: bool = True
     rotary: bool = True
     linear: bool = True
@@ -248,7 +261,8 @@ class Effect(AnyEffect):
     def row(self, values: Array, pitch: float) -> Array:
         """Lay the parameters out as a state function reads them, shape (ROW,)."""
         row = np.zeros(ROW)
-        row[: len(values)] = values
+        row[: len(values[:TURN])] = values[:TURN]
+        row[TURN + 1 : len(values) + 1] = values[TURN:]
         row[TURN] = 2.0 * np.pi / pitch
         return row
 

@@ -103,6 +103,8 @@ class AxisModel:
         match parameter.ref:
             case Ref.FORCE:
                 return self.rated_force
+            case Ref.PER_FORCE:
+                return 1.0 / self.rated_force
             case Ref.INERTIA:
                 return self.inertia
             case Ref.DAMPING:

@@ -13,6 +13,7 @@ from sioms.reconcile.checks import check
 from sioms.reconcile.contradictions import check_law, usable
 from sioms.reconcile.controlled import runs_the_loop
 from sioms.reconcile.effects import library
+from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
 from sioms.reconcile.model import AxisModel
@@ -48,6 +49,7 @@ class Options:
             are.
         mapper: as of ``Problem``.
         envelope: within which an experiment may be proposed; None takes it from the records.
+        without: effects that are left out of the library.
     """
 
     seed: int = 1
@@ -55,6 +57,7 @@ class Options:
     resample: int | None = None
     mapper: Mapper = map
     envelope: Envelope | None = None
+    without: tuple[str, ...] = ()
     progress: Callable[[str], None] = field(default=lambda text: None)
 
 
@@ -96,6 +99,8 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     Raises:
         BadInputError: the data cannot be used.
     """
+    if odd := sorted(set(o.without) - set(library())):
+        raise BadInputError(f"leave out effects: {', '.join(odd)} not known; known are {', '.join(sorted(library()))}")
     return replace(_prepared(session, nominal, o), blind=trusted_blindly(session, nominal))
 
 
@@ -184,6 +189,7 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
         excluded.add("encoder_scale")
     if any(r.force_measured is not None for r in session.records):
         excluded |= {"delay", "lag", "saturation"}
+    excluded |= set(o.without)
     names = tuple(n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded)
     final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
     if session.final:

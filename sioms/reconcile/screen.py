@@ -17,8 +17,9 @@ from scipy.signal import butter, sosfiltfilt
 
 from sioms.reconcile.bounces import rattles
 from sioms.reconcile.dry import dry_friction
-from sioms.reconcile.effect import Array, Effect, Parameter, Ref, Seen, Slot, Trials
+from sioms.reconcile.effect import Array, Effect, Over, Parameter, Ref, Seen, Slot, Trials
 from sioms.reconcile.effects import known
+from sioms.reconcile.effects.smooth import SIDE
 from sioms.reconcile.engine.search import Start
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
@@ -29,6 +30,8 @@ FEW = 4  # trials that further values are tried with
 #: First guesses of the level at speed and of the breakaway level, of a level that stood for both.
 DROPS = ((1.0, 1.4), (0.85, 1.05))
 SPEED_STEPS, PLACES = 7, 15
+#: The last place of a law of speed or force is where all but so few samples are within.
+SHOWN = 0.998
 #: Below this the measured motion stands for one without noise; a command is followed up to COMMAND_HZ, if to this
 #: share.
 SLOW_HZ, COMMAND_HZ, FOLLOWED = 5.0, 30.0, 0.2
@@ -142,6 +145,14 @@ def shapes(effect: Effect, model: AxisModel, travel: tuple[float, float]) -> Ite
             yield {shape.symbol: float(s * model.scale(shape))}
     else:
         yield {}
+
+
+def laid(effect: Effect, motions: list[Motion], travel: tuple[float, float]) -> dict[str, float]:
+    """Lay the places of a law over what the records show of its variable: about zero, or over the range of motion."""
+    if effect.over is Over.PLACE:
+        return {"middle": 0.5 * (travel[0] + travel[1]), "step": 0.5 * (travel[1] - travel[0]) / SIDE}
+    size = np.abs(np.concatenate([m.v if effect.over is Over.SPEED else m.u for m in motions]))
+    return {"middle": 0.0, "step": max(float(np.quantile(size, SHOWN)), 1e-300) / SIDE}
 
 
 def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, float] | None = None) -> list[Start]:
@@ -266,7 +277,7 @@ def _screen_state(
     levels: Mapping[str, float],
 ) -> Start | None:
     best: Start | None = None
-    for shape in shapes(effect, fit.model, travel):
+    for shape in [laid(effect, motions, travel)] if effect.over else shapes(effect, fit.model, travel):
         f = _filtered(problem, fit, [state_columns(effect, fit.model, m, shape, dead) for m in motions])[
             thinned(len(fit.residual))
         ]

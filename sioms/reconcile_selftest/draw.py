@@ -33,50 +33,72 @@ NAMED = (
     "lugre",
     "friction_variation",
     "load_friction",
+    "power_drag",
+    "quadratic_direction",
+    "load_square_friction",
+    "warming_friction",
     "backlash",
     "elastic",
+    "swinging_load",
     "payload",
     "cogging",
     "gravity",
     "spring",
+    "hardening_spring",
+    "asymmetric_spring",
     "offset",
     "torque_ripple",
     "delay",
     "lag",
     "saturation",
     "thermal_gain",
+    "dead_band",
+    "gain_asymmetry",
     "encoder_scale",
     "encoder_quantisation",
     "eccentricity",
 )
 NAMELESS = (
-    "cubic_spring",
     "falling_drag",
+    "composite",
     "hysteresis",
     "swinging_inertia",
     "knocks",
-    "load_square",
     "stop",
     "detent",
+)
+#: Effects that are hidden from a solver who must do without them: unmet, and like nothing else in the library.
+UNMET = (
+    "hardening_spring",
+    "asymmetric_spring",
+    "dead_band",
+    "gain_asymmetry",
+    "quadratic_direction",
+    "load_square_friction",
+    "warming_friction",
+    "swinging_load",
 )
 #: Of each of these at most one is in a mixture: one drive, one transmission, one law of dry friction, one force along
 #: the range.
 EXCLUSIVE = (
     ("coulomb", "coulomb_position", "stribeck", "presliding", "lugre"),
     ("delay", "lag", "saturation"),
-    ("elastic", "backlash"),
-    ("gravity", "spring"),
+    ("elastic", "backlash", "swinging_load"),
+    ("gravity", "spring", "hardening_spring", "asymmetric_spring"),
+    ("viscous", "quadratic_drag", "power_drag"),
+    ("viscous_direction", "quadratic_direction"),
+    ("load_friction", "load_square_friction", "dead_band"),
+    ("thermal_gain", "warming_friction"),
     ("encoder_quantisation", "backlash"),
 )
 #: Laws of dry friction, of which one is beside a variation of it.
 VARYING = ("stribeck", "presliding", "lugre")
 #: Known effects that may be beside one that is outside the library.
 BESIDE = {
-    "cubic_spring": ("coulomb", "payload"),
+    "composite": ("coulomb", "payload"),
     "falling_drag": ("coulomb", "payload"),
     "stop": ("coulomb", "viscous"),
     "detent": ("viscous", "payload"),
-    "load_square": ("viscous", "offset"),
 }
 #: Only a measured current, or index marks, tell these from their look-alikes.
 BY_CURRENT, BY_MARKS = {"delay", "lag", "saturation"}, {"payload", "encoder_scale"}
@@ -140,7 +162,7 @@ def _drawn(name: str, kind: str, rng: np.random.Generator, only: str) -> Axis:
         hidden, rival = (str(p) for p in rng.permutation(CONFOUNDED[excitation]))
         named = [hidden]
     elif kind == "unknown":
-        nameless = [only or _pick(NAMELESS, axis, rng)]
+        nameless = [only or _pick((*NAMELESS, *UNMET), axis, rng)]
         beside = BESIDE.get(nameless[0], ())
         named = [str(rng.choice(beside))] if beside and rng.random() < 0.5 else []
     current = excitation != "no_current" and bool(BY_CURRENT & set(named) or rng.random() < 0.65)
@@ -249,6 +271,25 @@ def _by_count(servo: Servo, dt: float) -> float:
     return servo.k - servo.kb * share / dt
 
 
+def _composite(axis: Axis, reach: float, rng: np.random.Generator) -> Numbers:
+    """Draw a law that has no name: bends over the place, or a drag that bends over speed or place."""
+    kind = float(rng.integers(3))
+    size = axis.speed if kind == 1.0 else reach
+    amp = axis.rated * float(rng.uniform(0.08, 0.2))
+    at = rng.uniform(-0.5, 0.5, 2)
+    widths = rng.uniform(0.1, 0.4, 2)
+    return {
+        "kind": kind,
+        "amp": amp if kind == 0.0 else amp / axis.speed,
+        "size": size,
+        "at": float(at[0]),
+        "width": float(widths[0]),
+        "more": float(rng.uniform(-0.8, 1.0)) if kind == 0.0 else float(rng.uniform(0.0, 1.0)),
+        "at_more": float(at[1]),
+        "width_more": float(widths[1]),
+    }
+
+
 def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
     """Draw the size of an effect, clear of the noise and within what machines show."""
     f, v, j, x, q = axis.rated, axis.speed, axis.inertia, axis.pitch, axis.resolution
@@ -319,8 +360,27 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
         case "eccentricity":
             amp = x * (u(0.004, 0.01) if axis.rotary else u(0.001, 0.003))
             return {"amp": max(amp, 6.0 * q), "phase": phase}
-        case "cubic_spring":
-            return {"k": 0.25 * f / ((2.0 * x) ** 3 if axis.rotary else 0.1**3) * u(0.7, 1.5)}
+        case "hardening_spring":
+            return {"k3": f / reach**3 * u(0.2, 0.5)}
+        case "asymmetric_spring":
+            return {"d": sign * f / reach * u(0.1, 0.3)}
+        case "dead_band":
+            return {"w": f * u(0.04, 0.15)}
+        case "gain_asymmetry":
+            return {"d": sign * u(0.03, 0.12)}
+        case "power_drag":
+            n = float(rng.choice([u(0.4, 0.6), u(1.4, 1.7), u(2.5, 3.0)]))
+            return {"c": f / v**n * u(0.1, 0.3), "n": n}
+        case "quadratic_direction":
+            return {"c": sign * f / v**2 * u(0.08, 0.2)}
+        case "load_square_friction":
+            return {"g": u(0.2, 0.4) / f}
+        case "warming_friction":
+            return {"g": f / v * u(0.2, 0.5), "tau": u(3.0, 10.0)}
+        case "swinging_load":
+            return {"f_res": u(0.5, 1.5), "load_fraction": u(0.2, 0.4), "zeta": u(0.01, 0.05)}
+        case "composite":
+            return _composite(axis, reach, rng)
         case "falling_drag":
             return {"c": 2.0 * f * u(0.08, 0.16) / (v * 0.18), "v0": 0.18 * v}
         case "hysteresis":
@@ -332,8 +392,6 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
             return {"depth": u(0.2, 0.35), "n": float(rng.integers(1, 4)), "phase": phase}
         case "knocks":
             return {"height": f * u(0.4, 0.8), "count": 6.0}
-        case "load_square":
-            return {"mu": u(0.25, 0.4)}
         case "stop":
             return {"k": f / reach * u(0.6, 1.5), "x0": reach * u(0.1, 0.3)}
         case "detent":

@@ -35,6 +35,15 @@ PRIMARY = {
     "eccentricity": "amp",
     "thermal_gain": "loss",
     "payload": "J_extra",
+    "hardening_spring": "k3",
+    "asymmetric_spring": "d",
+    "dead_band": "w",
+    "gain_asymmetry": "d",
+    "power_drag": "n",
+    "quadratic_direction": "c",
+    "load_square_friction": "g",
+    "warming_friction": "g",
+    "swinging_load": "f_res",
 }
 
 

@@ -95,12 +95,32 @@ class Plant(NamedTuple):
     cogging_amp: float = 0.0
     cogging_n: float = 0.0
     cogging_phase: float = 0.0
+    hardening_spring_k3: float = 0.0
+    asymmetric_spring_d: float = 0.0
+    dead_band_w: float = 0.0
+    gain_asymmetry_d: float = 0.0
+    power_drag_c: float = 0.0
+    power_drag_n: float = 1.0
+    quadratic_direction_c: float = 0.0
+    load_square_friction_g: float = 0.0
+    warming_friction_g: float = 0.0
+    warming_friction_tau: float = 0.0
+    swinging_load_f_res: float = 0.0
+    swinging_load_load_fraction: float = 0.0
+    swinging_load_zeta: float = 0.0
     elastic_f_res: float = 0.0
     elastic_load_fraction: float = 0.0
     elastic_zeta: float = 0.0
     backlash_gap: float = 0.0
     backlash_load_fraction: float = 0.0
-    cubic_spring_k: float = 0.0
+    composite_kind: float = 0.0
+    composite_amp: float = 0.0
+    composite_size: float = 1.0
+    composite_at: float = 0.0
+    composite_width: float = 1.0
+    composite_more: float = 0.0
+    composite_at_more: float = 0.0
+    composite_width_more: float = 1.0
     falling_drag_c: float = 0.0
     falling_drag_v0: float = 1.0
     hysteresis_level: float = 0.0
@@ -113,7 +133,6 @@ class Plant(NamedTuple):
     detent_amp: float = 0.0
     detent_x0: float = 0.0
     detent_width: float = 1.0
-    load_square_mu: float = 0.0
     knocks_height: float = 0.0
     knocks_count: float = 0.0
 
@@ -199,6 +218,16 @@ def _held(queue: Array, at: float, step: float) -> float:
 
 
 @njit(cache=True, nogil=True)
+def _composite(p: Plant, x: float, v: float) -> float:
+    """Force of a form made anew: two bends over the place, or a drag that bends over speed or place."""
+    z = (v if p.composite_kind == 1.0 else x) / p.composite_size
+    one = 1.0 + np.tanh((z - p.composite_at) / p.composite_width)
+    two = 1.0 + np.tanh((z - p.composite_at_more) / p.composite_width_more)
+    bend = one + p.composite_more * two
+    return -p.composite_amp * (bend if p.composite_kind == 0.0 else bend * v)
+
+
+@njit(cache=True, nogil=True)
 def _march(
     p: Plant,
     sub: int,
@@ -220,11 +249,11 @@ def _march(
     """
     h, turn = p.sample_s / sub, 2.0 * np.pi / p.pitch
     total = p.inertia + p.payload_J_extra
-    share = p.elastic_load_fraction + p.backlash_load_fraction
+    share = p.elastic_load_fraction + p.swinging_load_load_fraction + p.backlash_load_fraction
     motor, load, two, loose = total * (1.0 - share), total * share, share > 0.0, 0.5 * p.backlash_gap
     reduced = total * share * (1.0 - share)
-    stiff = reduced * (2 * np.pi * (CONTACT_HZ if loose > 0.0 else p.elastic_f_res)) ** 2
-    damp = 2.0 * (CONTACT_ZETA if loose > 0.0 else p.elastic_zeta) * np.sqrt(stiff * reduced)
+    stiff = reduced * (2 * np.pi * (CONTACT_HZ if loose > 0.0 else p.elastic_f_res + p.swinging_load_f_res)) ** 2
+    damp = 2.0 * (CONTACT_ZETA if loose > 0.0 else p.elastic_zeta + p.swinging_load_zeta) * np.sqrt(stiff * reduced)
     give = YIELD * p.pitch
     quantum = p.resolution * p.encoder_quantisation_factor
     follow = 1.0 - np.exp(-h / p.lag_tau) if p.lag_tau > 0.0 else 1.0
@@ -262,9 +291,16 @@ def _march(
             x += 0.5 * h * v
             xl += 0.5 * h * vl
             theta = turn * x
-            f = drive * (1.0 - p.thermal_gain_loss * heat)
+            f = drive * (1.0 - p.thermal_gain_loss * heat) * (1.0 + p.gain_asymmetry_d * np.sign(drive))
+            f -= min(max(drive, -p.dead_band_w), p.dead_band_w)
+            if p.warming_friction_tau > 0.0:
+                heat += h / p.warming_friction_tau * (abs(v) - heat)
             f *= 1.0 + p.torque_ripple_depth * np.sin(p.torque_ripple_n * theta + p.torque_ripple_phase)
-            f += push[i] + p.offset_off - p.spring_k * x - p.cubic_spring_k * x**3
+            f += push[i] + p.offset_off - p.spring_k * x - p.hardening_spring_k3 * x**3
+            f -= p.asymmetric_spring_d * abs(x) + p.quadratic_direction_c * v * v
+            f -= p.power_drag_c * np.sign(v) * abs(v) ** p.power_drag_n
+            if p.composite_amp != 0.0:
+                f += _composite(p, x, v)
             f += p.gravity_amp * np.sin(x + p.gravity_phase)
             f += p.cogging_amp * np.sin(p.cogging_n * theta + p.cogging_phase)
             f -= (p.viscous + p.viscous_b_extra) * v
@@ -278,7 +314,8 @@ def _march(
             level = p.coulomb_Fc + p.coulomb_position_Fc
             level += p.coulomb_position_Fm * np.sin(p.coulomb_position_n * theta + p.coulomb_position_phase)
             level += p.stribeck_Fc + (p.stribeck_Fs - p.stribeck_Fc) * np.exp(-((v / p.stribeck_vs) ** 2))
-            level += p.load_friction_mu * abs(drive) + p.load_square_mu * drive * drive / p.rated
+            level += p.load_friction_mu * abs(drive) + p.load_square_friction_g * drive * drive
+            level += p.warming_friction_g * heat
             varied = 1.0 + p.friction_variation_depth * np.sin(
                 p.friction_variation_n * theta + p.friction_variation_phase
             )

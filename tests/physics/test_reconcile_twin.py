@@ -9,7 +9,7 @@ import pytest
 
 from sioms.plant.motor import MotorBank
 from sioms.plant.parameters import Motor
-from sioms.reconcile.effect import Channel, Effect, Parameter, Ref, Slot
+from sioms.reconcile.effect import NONE, Channel, Effect, Parameter, Ref, Slot
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.jit import state_function
 from sioms.reconcile.model import AxisModel
@@ -42,6 +42,14 @@ CASES: dict[str, dict[str, float]] = {
     "thermal_gain": {"loss": 0.8, "tau": 2.0},
     "elastic": {"f_res": 18.0, "load_fraction": 0.4, "zeta": 0.05},
     "payload": {"J_extra": 6e-4},
+    "hardening_spring": {"k3": 0.02},
+    "asymmetric_spring": {"d": 0.03},
+    "dead_band": {"w": 0.03},
+    "gain_asymmetry": {"d": 0.1},
+    "power_drag": {"c": 5e-3, "n": 1.5},
+    "quadratic_direction": {"c": 1e-4},
+    "load_square_friction": {"g": 0.4},
+    "swinging_load": {"f_res": 1.0, "load_fraction": 0.4, "zeta": 0.02},
 }
 #: What an effect acts on that does nothing alone.
 BESIDE = {"friction_variation": ("coulomb", "stribeck", "presliding", "lugre")}
@@ -71,7 +79,9 @@ def test_the_twin_moves_as_the_simulation(name: str, beside: str) -> None:
 
 def test_all_effects_that_a_plant_can_carry_out_have_a_case() -> None:
     sensor = {n for n, e in library().items() if e.channel is Channel.SENSOR}
-    assert {n for n, e in library().items() if not e.mechanism.bounces} == set(CASES) | sensor
+    without = {n for n, e in library().items() if e.mechanism is not NONE and e.mechanism.twin is None}
+    assert without == {"warming_friction"}
+    assert {n for n, e in library().items() if not e.mechanism.bounces} == set(CASES) | sensor | without
 
 
 def test_backlash_plays_and_hits_as_in_the_simulation() -> None:

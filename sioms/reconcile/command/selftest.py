@@ -19,7 +19,7 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile_selftest.axis import Axis
 from sioms.reconcile_selftest.commands import commands
-from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, draw_axis
+from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, UNMET, draw_axis
 from sioms.reconcile_selftest.score import Scored, score
 from sioms.reconcile_selftest.world import Recording, World
 
@@ -37,7 +37,7 @@ CURRENT, MARKS = 'force_measured = { name = "force_measured" }\n', 'index = { na
 def generate(count: int, seed: int) -> list[Axis]:
     """Draw the axes of a test; every effect comes up in turn."""
     rng = np.random.default_rng(seed)
-    effects = {"single": NAMED, "unknown": NAMELESS, "confounded": CONFOUNDED}
+    effects = {"single": NAMED, "unknown": (*NAMELESS, *UNMET), "confounded": CONFOUNDED}
     return [draw_axis(f"axis{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects)]
 
 
@@ -128,7 +128,9 @@ def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, repl
 
 
 def _judge(axis: Axis, records: list[Recording], folder: Path, replicates: int) -> Scored:
-    options = ("--jobs", "1")
+    options = ["--jobs", "1"]
+    for name in set(axis.nameless) & set(NAMED):
+        options += ["--without", name]
     answer = solve(folder, "axis", *options)
     again = [solve(folder, "axis", *options, "--resample", str(i), report=f"again{i}") for i in range(replicates)]
     share = closed(folder, records) if (folder / "report" / "model.toml").exists() else None

@@ -57,6 +57,13 @@ def _axis_arguments(parser: argparse.ArgumentParser) -> Any:
         metavar="SEED",
         help="resample the blocks of time, to test whether the verdict is stable",
     )
+    parser.add_argument(
+        "--without",
+        action="append",
+        default=[],
+        metavar="EFFECT",
+        help="leave an effect out of the library: is it refused, or does another name take its place?",
+    )
     group = parser.add_argument_group("with a node")
     group.add_argument(
         "--travel", type=positive, metavar="X", help="largest distance to either side of the present position"
@@ -94,7 +101,9 @@ def _analyse_axis(args: Args, say: Say) -> Any:
     nominal = read_model(args.model or args.data / "nominal.json")
     session = read_data(args.data, nominal, args.columns)
     with ThreadPoolExecutor(args.jobs or os.cpu_count() or 1) as pool:
-        options = Options(seed=args.seed, progress=say, mapper=pool.map, resample=args.resample)
+        options = Options(
+            seed=args.seed, progress=say, mapper=pool.map, resample=args.resample, without=tuple(args.without)
+        )
         return analyse(session, nominal, options)
 
 

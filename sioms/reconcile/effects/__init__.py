@@ -9,15 +9,29 @@ from __future__ import annotations
 from functools import cache
 
 from sioms.reconcile.effect import Effect
-from sioms.reconcile.effects import drive, friction, position, sensor, terms, transmission
+from sioms.reconcile.effects import (
+    amplifier,
+    drags,
+    drive,
+    friction,
+    position,
+    sensor,
+    smooth,
+    springs,
+    terms,
+    transmission,
+)
 from sioms.reconcile.library import collect
 
 GROUP = "sioms.effects"
 BUILT_IN: tuple[Effect, ...] = (
     *sensor.EFFECTS,
     *drive.EFFECTS,
+    *amplifier.EFFECTS,
     *friction.EFFECTS,
+    *drags.EFFECTS,
     *position.EFFECTS,
+    *springs.EFFECTS,
     *transmission.EFFECTS,
 )
 
@@ -35,4 +49,4 @@ def library() -> dict[str, Effect]:
 @cache
 def known() -> dict[str, Effect]:
     """Return the library and, beside it, the nameless terms that a refusal may offer."""
-    return {**library(), **{t.name: t for t in terms.TERMS}}
+    return {**library(), **{t.name: t for t in (*terms.TERMS, *smooth.LAWS)}}

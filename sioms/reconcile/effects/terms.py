@@ -24,7 +24,6 @@ from sioms.reconcile.effect import (
     StateFunction,
     Trials,
 )
-from sioms.reconcile.effects.drive import GRID_TAU
 from sioms.reconcile.effects.friction import BUILDING_UP, UNSEEN_STEPS, lengths
 from sioms.reconcile.jit import state_function
 
@@ -33,18 +32,6 @@ from sioms.reconcile.jit import state_function
 def square(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-k x^2."""
     return -p[0] * x * x
-
-
-@state_function
-def cube(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
-    """-k x^3."""
-    return -p[0] * x * x * x
-
-
-@state_function
-def even_drag(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
-    """-c v^2."""
-    return -p[0] * v * v
 
 
 @state_function
@@ -108,19 +95,9 @@ def place_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) 
 
 
 @state_function
-def warm_level(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
-    """g T."""
-    return p[0] * temperature
-
-
-@state_function
 def dull_force(x: Number, v: Number, u: Number, temperature: Number, p: Array) -> Number:
     """-f tanh(u/u0)."""
     return -p[0] * np.tanh(u / p[1])
-
-
-def _warming(row: Any, p: Array) -> None:
-    row.warming, row.tau_t = 1.0, p[1]
 
 
 def _turning(row: Any, p: Array) -> None:
@@ -174,7 +151,6 @@ def _term(
 
 TERMS = (
     _term("x2", "F = -k x^2", square, _size("k", "{F}/{x}^2", Ref.STIFFNESS)),
-    _term("x3", "F = -k x^3", cube, _size("k", "{F}/{x}^3", Ref.STIFFNESS), lookalikes=("spring",)),
     _term(
         "stop_above",
         "F = -k (x - x0) where x > x0",
@@ -191,7 +167,6 @@ TERMS = (
         PLACE,
         lookalikes=("spring",),
     ),
-    _term("v2", "F = -c v^2", even_drag, _size("c", "{F} s^2/{x}^2", Ref.DRAG)),
     _term(
         "v3",
         "F = -c v^3",
@@ -239,17 +214,6 @@ TERMS = (
         place_level,
         _size("g", "{F}/{x}", Ref.STIFFNESS, "slope of dry friction along the range"),
         slot=Slot.FRICTION,
-    ),
-    _term(
-        "warm_friction",
-        "F = -g T sign(v), tau dT/dt = |v| - T",
-        warm_level,
-        _size("g", "{F} s/{x}", Ref.DAMPING, "what friction gains where the axis has moved of late"),
-        Parameter("tau", "s", Ref.TIME, 0.5, 1e4, 10.0, "time over which it does"),
-        slot=Slot.FRICTION,
-        mechanism=Mechanism(_warming, warms=True),
-        trials=Trials(lambda seen: ({"tau": g} for g in GRID_TAU)),
-        replaces=("thermal_gain",),
     ),
     _term("load_square", "F = -g u |u|", load_square, _size("g", "1/({F})", Ref.ONE)),
     _term(

@@ -10,6 +10,7 @@ from sioms.reconcile.effect import Array, Channel, Effect, Mechanism, Parameter,
 
 #: First guesses: resonances [Hz] and shares of the inertia, gaps over the pitch.
 GRID_RESONANCE = (7.0, 11.0, 16.0, 24.0, 36.0, 55.0)
+GRID_SWING = (0.3, 0.5, 0.8, 1.3)
 GRID_LOAD = (0.3, 0.6)
 GRID_GAP = tuple(float(g) for g in np.geomspace(3e-4, 0.18, 24))
 #: A contact that bounces makes a cost of many minima; started with one that does not, it would not find all that do.
@@ -67,9 +68,31 @@ ELASTIC = Effect(
         Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.05, "damping ratio"),
     ),
     signature="force residual concentrated around one frequency, whatever the position",
-    lookalikes=("delay", "lag", "backlash", "payload"),
+    lookalikes=("delay", "lag", "backlash", "payload", "swinging_load"),
     separate="a multi-sine across the resonance at two amplitudes",
-    replaces=("backlash",),
+    replaces=("backlash", "swinging_load"),
+)
+SWINGING_LOAD = Effect(
+    name="swinging_load",
+    title="load that swings or sloshes (slow second mass)",
+    channel=Channel.MECHANICS,
+    mechanism=Mechanism(_elastic, _elastic_twin, last=True),
+    trials=Trials(
+        lambda seen: ({"f_res": g, "load_fraction": f} for g in GRID_SWING for f in GRID_LOAD),
+        kept=2,
+        stretched=False,
+    ),
+    sized=False,
+    equation="as two masses: (1-r) J hold the axis, r J hang on it and swing about it at f_res",
+    parameters=(
+        Parameter("f_res", "Hz", Ref.FREQUENCY, 0.15, 2.0, 0.8, "frequency of the pair, the axis let go"),
+        Parameter("load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.3, "share of the inertia that swings"),
+        Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.02, "damping ratio"),
+    ),
+    signature="force residual at one low frequency that goes on after the axis has stopped",
+    lookalikes=("elastic", "payload", "spring"),
+    separate="short moves, and rests of several periods after them",
+    replaces=("elastic", "backlash"),
 )
 BACKLASH = Effect(
     name="backlash",
@@ -101,7 +124,7 @@ BACKLASH = Effect(
     signature="bursts of force residual after every reversal of force",
     lookalikes=("stribeck", "presliding", "elastic"),
     separate="force reversals of several amplitudes about rest",
-    replaces=("elastic",),
+    replaces=("elastic", "swinging_load"),
 )
 PAYLOAD = Effect(
     name="payload",
@@ -127,4 +150,4 @@ PAYLOAD = Effect(
     separate="index marks, or a known added mass",
 )
 
-EFFECTS = (ELASTIC, BACKLASH, PAYLOAD)
+EFFECTS = (ELASTIC, SWINGING_LOAD, BACKLASH, PAYLOAD)

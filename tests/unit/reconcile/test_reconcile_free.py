@@ -24,7 +24,7 @@ LOOP = Controller(20.0, -0.985, -0.7, 0.0, 0.0, 1.8, 100.0)
 AXIS = AxisModel(True, DT, 2e-3, 1e-3, 2e-5, 2.0 * np.pi, 0.7, 20.0, LOOP)
 #: A mass on a spring, 22 Hz, whose free vibration lasts a quarter of a second, and no controller.
 RESONATOR = AxisModel(False, DT, 1.0, 8.0, 1e-7, 0.01, 100.0, 0.5).with_effect("spring", {"k": 2e4})
-HARD = RESONATOR.with_effect("term_x3", {"k": 4e8})
+HARD = RESONATOR.with_effect("hardening_spring", {"k3": 4e8})
 
 
 def coloured(size: float, seed: int) -> Array:

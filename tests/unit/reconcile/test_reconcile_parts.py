@@ -281,12 +281,12 @@ def test_friction_that_follows_the_motion_is_told_from_one_that_stays() -> None:
     slow = np.repeat([0.2, 1.0, 0.2, 1.0], 1000) * COMMAND / 1.4
     slow = np.convolve(np.concatenate([np.zeros(100), slow]), np.ones(101) / 101, "valid")
     values = {"g": 0.02, "tau": 0.8}
-    p = problem(session(AXIS.with_effect("term_warm_friction", values), slow))
+    p = problem(session(AXIS.with_effect("warming_friction", values), slow))
     fits = [
         refit(p, AXIS.with_effect(*s))
-        for s in (("coulomb", {"Fc": 0.05}), ("term_warm_friction", {"g": 0.01, "tau": 2.0}))
+        for s in (("coulomb", {"Fc": 0.05}), ("warming_friction", {"g": 0.01, "tau": 2.0}))
     ]
-    assert fits[1].model.effects["term_warm_friction"] == pytest.approx(values, rel=0.03)
+    assert fits[1].model.effects["warming_friction"] == pytest.approx(values, rel=0.03)
     assert fits[0].ratio > 3.0 * fits[1].ratio
 
 
