@@ -40,7 +40,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     model = found.fit.model
     lib = library()
     alike = {
-        name: [n for n in _alike(name) if n in searcher.names and n not in model.effects]
+        name: [n for n in lookalikes(name) if n in searcher.names and n not in model.effects]
         for name in model.effects
         if name not in searcher.frozen and name in lib
     }
@@ -75,8 +75,9 @@ def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     )
 
 
-def _alike(name: str) -> list[str]:
-    """Look-alikes in either direction, without those that merely contain the effect or are contained in it."""
+def lookalikes(name: str) -> list[str]:
+    """List look-alikes in either direction, without those that merely contain the effect or are contained in it."""
     lib = library()
     both = [n for n in lib if n in lib[name].lookalikes or name in lib[n].lookalikes]
-    return [n for n in both if n not in lib[name].replaces and size(n) <= size(name) + 1]
+    contain = [n for n in both if name in lib[n].replaces and size(n) > size(name)]
+    return [n for n in both if n not in (*lib[name].replaces, *contain) and size(n) <= size(name) + 1]

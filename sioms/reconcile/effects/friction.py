@@ -176,7 +176,7 @@ COULOMB = Effect(
     equation="F = -Fc sign(v); at rest it holds any force up to Fc",
     parameters=(Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "friction level"),),
     signature="force residual steps with the direction of motion and does not depend on speed",
-    lookalikes=("stribeck", "viscous", "offset", "presliding"),
+    lookalikes=("stribeck", "viscous", "offset", "presliding", "dead_band"),
     separate="slow reversals and cruise at several speeds both ways",
     replaces=("stribeck", "presliding", "lugre", "coulomb_position"),
 )

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from sioms.reconcile.ambiguity import settle
+from sioms.reconcile.ambiguity import lookalikes, settle
 from sioms.reconcile.blocks import better, formal, heldout, intervals
 from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import drive, drive_output, index_fit, lattice
@@ -210,6 +210,13 @@ def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> No
     assert set(found.fit.model.effects) == {"viscous"}
     assert [step.action for step in found.ladder] == ["swap"]
     assert not any(r.open for r in others)
+
+
+def test_a_richer_law_that_contains_a_named_one_is_no_look_alike_of_it() -> None:
+    """A drag with a power of the speed is quadratic at the exponent two, whatever the records: that rules nothing in."""
+    for plain in ("viscous", "quadratic_drag"):
+        assert "power_drag" not in lookalikes(plain) and plain not in lookalikes("power_drag")
+    assert "dead_band" in lookalikes("coulomb") and "coulomb" in lookalikes("dead_band")
 
 
 def test_a_residual_that_suits_everything_has_no_name() -> None:
