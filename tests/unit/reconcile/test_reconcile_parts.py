@@ -213,7 +213,7 @@ def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> No
 
 
 def test_a_richer_law_that_contains_a_named_one_is_no_look_alike_of_it() -> None:
-    """A drag with a power of the speed is quadratic at the exponent two, whatever the records: that rules nothing in."""
+    """A drag with a power of the speed is quadratic at the exponent two: no record could rule it out."""
     for plain in ("viscous", "quadratic_drag"):
         assert "power_drag" not in lookalikes(plain) and plain not in lookalikes("power_drag")
     assert "dead_band" in lookalikes("coulomb") and "coulomb" in lookalikes("dead_band")
