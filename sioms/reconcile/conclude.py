@@ -15,6 +15,7 @@ from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.disturbance import disturbance
 from sioms.reconcile.effect import Array
+from sioms.reconcile.effects.smooth import LAWS
 from sioms.reconcile.engine.evidence import alternative, outcome
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
@@ -88,7 +89,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
     spans = spans_of(whole, fit, others_as_deep)
-    named, terms = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
+    named, terms = formulas(*describe(ready.findings, fit, found, s.searcher, others, spans, rng))
     terms += [force.term for force in ready.timed]
     open_rivals = [r for r in others if r.open]
     ratio = found.fit.ratio
@@ -152,6 +153,19 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         rejected=s.rejected,
         others=tuple(q.fit.model.effects for q in open_now),
     )
+
+
+def formulas(named: Sequence[NamedEffect], terms: Sequence[NamedEffect]) -> tuple[list[NamedEffect], list[NamedEffect]]:
+    """Take its name from an effect beside which a nameless term of the same variable stands: together they are one law
+    of that variable, of which nobody can tell how much the effect is.
+
+    Returns:
+        What is named, and the formulas without a name.
+    """
+    beside = {t.name for t in terms}
+    within = {n for law in LAWS if beside & set(law.replaces) for n in law.replaces}
+    parts = [replace(e, title=e.equation) for e in named if e.name in within]
+    return [e for e in named if e.name not in within], [*terms, *parts]
 
 
 def refused(

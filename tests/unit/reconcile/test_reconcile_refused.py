@@ -12,7 +12,7 @@ import pytest
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.axis_verdict import AxisVerdict
-from sioms.reconcile.conclude import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, as_stated, refused
+from sioms.reconcile.conclude import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, as_stated, formulas, refused
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.model_file import parse_model, write_model
 from sioms.reconcile.prepare import Options
@@ -51,6 +51,16 @@ def test_a_refused_model_has_the_stated_numbers_where_they_were_refined() -> Non
     nominal = replace(read_model(AXES / "s05" / "nominal.json"), refine=("inertia",))
     tried = replace(nominal, inertia=3.0 * nominal.inertia, viscous=0.1)
     assert as_stated(tried, nominal) == replace(nominal, viscous=0.1)
+
+
+def test_beside_a_nameless_term_of_the_same_variable_nothing_has_a_name() -> None:
+    """Of a force that bends over the place, a spring is whatever part of it was taken for one."""
+    named = [effect("coulomb"), effect("spring"), effect("viscous")]
+    found, terms = formulas(named, [effect("term_stop_below")])
+    assert [e.name for e in found] == ["coulomb", "viscous"]
+    assert [e.name for e in terms] == ["term_stop_below", "spring"]
+    assert [e.name for e in formulas(named, [effect("term_falling_drag")])[0]] == ["coulomb", "spring"]
+    assert formulas(named, []) == (named, [])
 
 
 @cache
