@@ -224,7 +224,7 @@ def _composite(p: Plant, x: float, v: float) -> float:
     one = 1.0 + np.tanh((z - p.composite_at) / p.composite_width)
     two = 1.0 + np.tanh((z - p.composite_at_more) / p.composite_width_more)
     bend = one + p.composite_more * two
-    return -p.composite_amp * (bend if p.composite_kind == 0.0 else bend * v)
+    return float(-p.composite_amp * (bend if p.composite_kind == 0.0 else bend * v))
 
 
 @njit(cache=True, nogil=True)
