@@ -53,7 +53,7 @@ POWER_DRAG = Effect(
     equation="F = -c |v|^n sign(v)",
     parameters=(
         Parameter("c", "{F} (s/{x})^n", Ref.FORCE, 0.0, 1e4, 0.02, "drag at unit speed"),
-        Parameter("n", "1", Ref.ONE, 0.3, 3.5, 1.5, "exponent", shape=True),
+        Parameter("n", "1", Ref.ONE, 0.3, 3.5, 1.5, "exponent", shape=True, vanishes=True),
     ),
     signature="force residual that grows with a power of speed, odd in direction",
     lookalikes=("viscous", "quadratic_drag", "coulomb"),

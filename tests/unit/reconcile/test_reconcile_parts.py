@@ -24,7 +24,7 @@ from sioms.reconcile.fit import LEFT, Problem, block_ids, free_parameters, jacob
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
-from sioms.reconcile.plausible import unspecific
+from sioms.reconcile.plausible import leans, unspecific
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.screen import screen
@@ -210,6 +210,13 @@ def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> No
     assert set(found.fit.model.effects) == {"viscous"}
     assert [step.action for step in found.ladder] == ["swap"]
     assert not any(r.open for r in others)
+
+
+def test_a_power_near_none_is_dry_friction() -> None:
+    """At its least exponent a drag stands for Coulomb friction, and is no confounder of it at one speed."""
+    assert leans(AXIS.with_effect("power_drag", {"c": 0.1, "n": 0.3}), "power_drag")
+    assert leans(AXIS.with_effect("power_drag", {"c": 0.1, "n": 3.5}), "power_drag")
+    assert not leans(AXIS.with_effect("power_drag", {"c": 0.1, "n": 1.5}), "power_drag")
 
 
 def test_a_richer_law_that_contains_a_named_one_is_no_look_alike_of_it() -> None:
