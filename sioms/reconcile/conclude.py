@@ -15,7 +15,7 @@ from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.disturbance import disturbance
 from sioms.reconcile.effect import Array
-from sioms.reconcile.effects.smooth import LAWS
+from sioms.reconcile.effects.smooth import CONSTANT, LAWS
 from sioms.reconcile.engine.evidence import alternative, outcome
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
@@ -157,13 +157,15 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
 
 def formulas(named: Sequence[NamedEffect], terms: Sequence[NamedEffect]) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Take its name from an effect beside which a nameless term of the same variable stands: together they are one law
-    of that variable, of which nobody can tell how much the effect is.
+    of that variable, of which nobody can tell how much the effect is; so are a constant and a law without a zero of its
+    own.
 
     Returns:
         What is named, and the formulas without a name.
     """
     beside = {t.name for t in terms}
-    within = {n for law in LAWS if beside & set(law.replaces) for n in law.replaces}
+    laws = [law for law in LAWS if beside & {law.name, *law.replaces}]
+    within = {n for law in laws for n in (*law.replaces, CONSTANT.get(law.name, ""))}
     parts = [replace(e, title=e.equation) for e in named if e.name in within]
     return [e for e in named if e.name not in within], [*terms, *parts]
 

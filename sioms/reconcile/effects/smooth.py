@@ -130,3 +130,9 @@ LAWS = (
          by_place, Over.PLACE, ("{F}", Ref.FORCE, "{x}"), ("coulomb_position", "term_place_friction"),
          Slot.FRICTION, DRY),
 )  # fmt: skip
+#: What has the constant of a law, which is zero in the middle by convention alone.
+CONSTANT = {
+    "term_law_of_place": "offset",
+    "term_drag_by_place": "viscous",
+    "term_friction_by_place": "coulomb",
+}

@@ -63,6 +63,19 @@ def test_beside_a_nameless_term_of_the_same_variable_nothing_has_a_name() -> Non
     assert formulas(named, []) == (named, [])
 
 
+def test_a_constant_beside_a_nameless_law_has_no_name() -> None:
+    """A law of the place is zero at a place of nobody's choice: the offset beside it is the rest of it."""
+    named = [effect("offset"), effect("viscous"), effect("payload")]
+    for term, left in (
+        ("term_stop_above", ["viscous", "payload"]),
+        ("term_law_of_place", ["viscous", "payload"]),
+        ("term_xv", ["offset", "payload"]),
+        ("term_drag_by_place", ["offset", "payload"]),
+        ("term_falling_drag", ["offset", "payload"]),
+    ):
+        assert [e.name for e in formulas(named, [effect(term)])[0]] == left, term
+
+
 @cache
 def verdict() -> AxisVerdict:
     """Return the verdict on a model that has been refused though the search came to friction."""
