@@ -67,7 +67,7 @@ QUADRATIC_DIRECTION = Effect(
     slot=Slot.FORCE,
     function=even_force,
     equation="F = -c v^2: the drag coefficient is larger by c forward, smaller by c backward",
-    parameters=(Parameter("c", "{F} s^2/{x}^2", Ref.DRAG, -5.0, 5.0, 0.03, "half the difference of the coefficients"),),
+    parameters=(Parameter("c", "{F} s^2/{x}^2", Ref.DRAG, -1.0, 1.0, 0.03, "half the difference of the coefficients"),),
     signature="force residual with the square of speed, even in direction",
     lookalikes=("viscous_direction", "offset"),
     separate="cruise at several speeds both ways, and rest",

@@ -40,7 +40,7 @@ def test_a_law_that_varies_by_itself_takes_no_factor() -> None:
     assert not room_for(VARYING, "coulomb").effects
     assert not accompanied(VARYING, FACTOR)
     assert not accompanied(AXIS.with_effect("coulomb", {"Fc": 0.04}), FACTOR)
-    assert all(accompanied(AXIS, n) for n in known() if n != FACTOR)
+    assert all(accompanied(AXIS, n) == (not known()[n].beside) for n in known())
 
 
 def test_coulomb_friction_with_the_factor_is_coulomb_friction_that_varies() -> None:
