@@ -62,8 +62,9 @@ def test_devin_timed(shell: Shell) -> None:
 def test_damper_in_a_pipe(shell: Shell, cell: sioms.Workcell) -> None:
     node = cell.open("mod0.readonly")
     before = node.read().position[0]
-    good(shell("set -o pipefail; devin -t0.005 -n3 -L60 lord1 | devout -rv -L-1 -W mod0.xaxis"))
-    assert 0.015 < node.read().position[0] - before < 0.06  # 0.1 N m make 0.1 m/s for 0.3 s
+    good(shell("set -o pipefail; devin -t0.005 -n3 -L100 lord1 | devout -rv -L-1 -W mod0.xaxis"))
+    # 0.1 N m make 0.1 m/s for 0.5 s, less by what devout takes to begin
+    assert 0.005 < node.read().position[0] - before < 0.08
     halted(cell)
 
 
