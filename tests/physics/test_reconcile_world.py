@@ -102,7 +102,7 @@ def test_an_eccentric_encoder_is_right_at_every_mark() -> None:
     np.testing.assert_allclose(np.diff(seen.counts[at] * 1e-9), 0.01, atol=2e-4)
 
 
-@pytest.mark.parametrize(("kind", "only"), [("confounded", "small"), ("unknown", "load_square")])
+@pytest.mark.parametrize(("kind", "only"), [("confounded", "small"), ("unknown", "load_square_friction")])
 def test_a_draw_that_is_asked_for_is_drawn(kind: str, only: str) -> None:
     axis = draw_axis("a", kind, np.random.default_rng(2), only)
     assert axis.excitation == (only if kind == "confounded" else "full")

@@ -113,7 +113,7 @@ state = 1
     words = (
         "number 4: node = mod0.zaxis, which does not exist", "number 5: column = status; want one of the axis node",
         "number 6: io0.in.bit1 is a binary node of single bits; want state", "number 7: on_minor = stop_device; device",
-        "number 8: state = 1; force0 is no binary node",
+        "number 8: state = 1; force0 is not a binary node",
     )  # fmt: skip
     with daemon.cell("tester") as cell, raises(errno.EINVAL, *words):
         cell.reload()
