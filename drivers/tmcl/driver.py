@@ -51,6 +51,8 @@ DRIVER_FAULTS = {
 EXTENDED_FAULTS = {1: "motor stalled", 2: "deviation from the encoder too large"}
 """Bits of axis parameter 207."""
 FAULT_BITS = {Axis.DRIVER_ERRORS: DRIVER_FAULTS, Axis.EXTENDED_ERRORS: EXTENDED_FAULTS}
+SURE = 0.8
+"""Share of the heartbeat from which on the module may have been silent for all of it."""
 SELDOM_NS = 500_000_000
 PAD_S = 0.01
 """How long after a single byte, beside the time of the characters, the module has to say that it was the ninth."""
@@ -198,6 +200,8 @@ class TmclUnit(AxesUnit):
         self._faults = [""] * len(self._motors)
         self._without: set[int] = set()
         self._seldom_ns = 0
+        self._asked_ns = self._silent_ns = 0
+        """When it was last asked, and the longest that it was not since a search began."""
 
     def open(self) -> Steps:
         """Identify the module, stop what moves it, arm its heartbeat and set its limits; all are read back."""
@@ -271,6 +275,7 @@ class TmclUnit(AxesUnit):
             if self._homes[axis]:
                 moving[axis], done[axis] = searches, not searches
                 self._homes[axis] = searches
+                done[axis] &= not (yield from self._breaks_off(axis))
         if self.clock() >= self._seldom_ns:
             self._seldom_ns = self.clock() + SELDOM_NS
             yield from self._read_faults()
@@ -302,7 +307,23 @@ class TmclUnit(AxesUnit):
     def home(self, axis: int) -> Steps:
         """Begin the module's reference search."""
         yield from self._ask(self._module.exchange(Op.RFS, 0, self._motors[axis]))
-        self._homes[axis] = True
+        self._homes[axis], self._silent_ns = True, 0
+
+    def _breaks_off(self, axis: int) -> Generator[Any, Any, bool]:
+        """Break off a search during which the module has not been asked for as long as its heartbeat lasts; return
+        whether that was so.
+
+        The heartbeat stops the motor, and the search is over then as one that has found its switch.
+        """
+        silent_s, heartbeat_s = self._silent_ns * 1e-9, self._settings.heartbeat_s
+        if not heartbeat_s or silent_s < SURE * heartbeat_s:
+            return False
+        self._homes[axis] = False
+        with suppress(DeviceError):
+            yield from self._ask(self._module.exchange(Op.RFS, 1, self._motors[axis]), repeatable=True)
+        self.lose_place(axis, f"the reference search was broken off: nothing was asked for {silent_s:.3g} s, and after "
+                              f"{heartbeat_s:g} s the module stops its motors; home again")  # fmt: skip
+        return True
 
     def reset(self, axis: int) -> Steps:
         """Read the errors again: reading the extended flags clears what has passed."""
@@ -321,6 +342,9 @@ class TmclUnit(AxesUnit):
             search: the module may be of a kind that does not answer a wrong checksum, which takes long to find out.
             repeatable: though the codec does not know that it is.
         """
+        now_ns = self.clock()
+        self._silent_ns = max(self._silent_ns, now_ns - (self._asked_ns or now_ns))
+        self._asked_ns = now_ns
         repeatable = repeatable or exchange.repeatable
         if self.framing.unanswered:
             yield from self._into_step(search=search)

@@ -12,6 +12,7 @@ from sioms.drivers.tmcl import simulator as tmcl
 from sioms.drivers.tmcl.codec import Op
 from sioms.drivers.tmcl.driver import Tmcl
 from sioms.motion import ActionKind, DriveAction
+from sioms.protocol.flags import AxisStatus
 from sioms.sdk.exchange import DeviceError, LinkError, StateLost
 
 AXIS = {"name": "x", "motor": 0, "travel_per_turn": 0.01, "microsteps_per_turn": 51200, **LIMITS}
@@ -263,6 +264,23 @@ def test_the_stop_goes_out_though_the_end_of_the_search_is_refused() -> None:
     rig.device.handlers()["refuse"]("1")
     rig.do(rig.unit.halt(0, fastest=True))
     assert rig.device.motors[0].mover.top_speed == 0 and not rig.device.motors[0].searching
+
+
+@pytest.mark.parametrize("pause_s", [0.3, 0.8])
+def test_a_search_that_the_heartbeat_has_ended_is_no_homing(pause_s: float) -> None:
+    rig = opened({"axis": [{**AXIS, "homing": True}]})
+    rig.unit.bank.home([0], 0)
+    rig.do(rig.unit.home(0))
+    for _ in range(5):
+        rig.wait(0.02)
+        rig.do(rig.unit.poll())
+    assert rig.device.motors[0].searching
+    rig.wait(pause_s)
+    rig.do(rig.unit.poll())
+    found = AxisStatus(int(rig.unit.bank.rows["status"][0]))
+    assert (AxisStatus.POSITION_LOST in found) == (pause_s > 0.5) and AxisStatus.HOMED not in found
+    assert rig.unit._homes[0] == bool(rig.device.motors[0].searching) == (pause_s < 0.5)
+    assert ("home again" in rig.unit.bank.fault_text(0)) == (pause_s > 0.5)
 
 
 def test_single_bytes_take_their_time_at_9600() -> None:
