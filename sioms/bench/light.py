@@ -100,6 +100,7 @@ def _own(daemon: Daemon) -> None:
 def _device(number: int) -> str:
     text = axes(f"light{number}", tick_hz=RATE_HZ, history=HISTORY, capacity=16, limits=False,
                 axis_keys="bandwidth_hz = 5.0\n")  # fmt: skip
+    text = text.replace("realtime_priority = 50\n", "realtime_priority = 0\n")  # as simulated devices have it
     return text.replace("late_max_s = 0.5\n", f'late_max_s = {LATE_S}\nprocess = "light"\n')
 
 
