@@ -416,3 +416,20 @@ static int ask_open(int sock, const char *name, struct message *m, int *fds, int
     memcpy(packet + n, OPEN_TAIL, sizeof OPEN_TAIL);
     return ask(sock, packet, n + sizeof OPEN_TAIL, number, m, fds, fd_count);
 }
+
+static void take_line(char **words);
+
+/* Be the tool whose words these are, with signals and descriptors as the one in Python has them; argv: this program, then
+ * the command that the tool in Python is, of which the words begin at FIRST_WORD.
+ */
+static void be_tool(int argc, char **argv)
+{
+    arguments = argv;
+    if (argc < FIRST_WORD || !is_of_these_sources())
+        leave_to_python();
+    take_line(argv + FIRST_WORD);
+    signal(SIGINT, SIG_DFL);
+    signal(SIGPIPE, SIG_DFL);
+    prctl(PR_SET_NAME, TOOL);
+    occupy_standard_descriptors();
+}

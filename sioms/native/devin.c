@@ -270,17 +270,9 @@ static void repeat(char *text, int numbered)
     }
 }
 
-/* argv: this program, then the command that the tool in Python is, of which the words begin at FIRST_WORD. */
 int main(int argc, char **argv)
 {
-    arguments = argv;
-    if (argc < FIRST_WORD || !is_of_these_sources())
-        leave_to_python();
-    take_line(argv + FIRST_WORD);
-    signal(SIGINT, SIG_DFL);
-    signal(SIGPIPE, SIG_DFL);
-    prctl(PR_SET_NAME, TOOL);
-    occupy_standard_descriptors();
+    be_tool(argc, argv);
     struct message m;
     int fds[8], fd_count, sock = connect_to_daemon(), numbered = 0;
     if (ask(sock, HELLO, sizeof HELLO, HELLO_NUMBER, &m, fds, &fd_count))

@@ -299,20 +299,12 @@ static void send_write(const uint8_t *data, size_t size)
         await(WRITE_NUMBER); /* which finds why */
 }
 
-/* argv: this program, then the command that the tool in Python is, of which the words begin at FIRST_WORD. */
 int main(int argc, char **argv)
 {
     static uint8_t data[MOST_DATA];
     struct message m;
     int fds[8], fd_count;
-    arguments = argv;
-    if (argc < FIRST_WORD || !is_of_these_sources())
-        leave_to_python();
-    take_line(argv + FIRST_WORD);
-    signal(SIGINT, SIG_DFL);
-    signal(SIGPIPE, SIG_DFL);
-    prctl(PR_SET_NAME, TOOL);
-    occupy_standard_descriptors();
+    be_tool(argc, argv);
     node.daemon = connect_to_daemon();
     if (ask(node.daemon, HELLO, sizeof HELLO, HELLO_NUMBER, &m, fds, &fd_count))
         leave_to_python();
