@@ -319,7 +319,7 @@ class TmclUnit(AxesUnit):
         if not heartbeat_s or silent_s < SURE * heartbeat_s:
             return False
         self._homes[axis] = False
-        with suppress(DeviceError):
+        with suppress(DeviceError):  # the fault below stops the motor as well
             yield from self._ask(self._module.exchange(Op.RFS, 1, self._motors[axis]), repeatable=True)
         self.lose_place(axis, f"the reference search was broken off: nothing was asked for {silent_s:.3g} s, and after "
                               f"{heartbeat_s:g} s the module stops its motors; home again")  # fmt: skip
