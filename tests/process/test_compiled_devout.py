@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -182,7 +183,8 @@ def test_the_usual_lines_need_no_interpreter_and_others_are_given_to_it_whole(da
 def test_closed_descriptors_change_nothing_but_what_is_said(daemon: Daemon, closed: str) -> None:
     found = []
     for compiled in (True, False):
-        line = f"{TOOL} mod0.xaxis 9 {closed}; echo $? >&3; {TOOL} -W mod0.xaxis 0 {closed}; echo $? >&3"
+        tool = shlex.quote(str(TOOL))
+        line = f"{tool} mod0.xaxis 9 {closed}; echo $? >&3; {tool} -W mod0.xaxis 0 {closed}; echo $? >&3"
         done = subprocess.run(
             ["sh", "-c", f"exec 3>&1; {line}"], env=environment(daemon, compiled), stdout=-1, stderr=-1
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -32,7 +33,7 @@ def test_the_first_session_works_when_it_is_pasted(tmp_path: Path) -> None:
     lines = commands(block("console", "A first session"))
     activate, *rest = lines
     assert activate == ". .venv/bin/activate"
-    script = "\n".join(["set -eo pipefail", f"PATH={BIN}:$PATH", *rest, "kill %1", "wait %1"])
+    script = "\n".join(["set -eo pipefail", f"PATH={shlex.quote(str(BIN))}:$PATH", *rest, "kill %1", "wait %1"])
     environment = {
         **os.environ, "SIOMS_SOCKET": str(tmp_path / "d.sock"), "XDG_RUNTIME_DIR": str(tmp_path),
         "SIOMS_STATE": str(tmp_path),

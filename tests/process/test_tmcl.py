@@ -17,7 +17,7 @@ CONFIG = """
 driver = "tmcl"
 line = { serial = "{port}", baud = 115200 }
 module = 1140
-heartbeat_s = 0.2
+heartbeat_s = 0.5
 poll_hz = 50.0
 [[device.mod0.axis]]
 name = "x"
@@ -43,7 +43,7 @@ def test_moves_homes_and_faults(start: Callable[..., Any], short_folder: Path) -
     wire = Wire(start, short_folder, "tmcl.simulator", "--motors", "2", "--baud", "115200")
     cell = wire.serve(CONFIG)
     wire.wait_up("mod0.x")
-    assert wire.state("heartbeat_ms") == 200
+    assert wire.state("heartbeat_ms") == 500
     with cell.open("mod0", "rw") as both:
         # two motors at once, the second reversed
         both.command(position=0.02, axis=0)

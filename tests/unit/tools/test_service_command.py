@@ -12,6 +12,9 @@ from sioms.tools import service
 from sioms.tools.front import main
 
 
+installs = pytest.mark.skipif(" " in sys.prefix, reason="an environment in a path with a space is refused")
+
+
 def files(root: Path) -> set[str]:
     return {str(path.relative_to(root)) for path in root.rglob("*") if path.is_symlink() or path.is_file()}
 
@@ -20,6 +23,7 @@ def install(root: Path, *words: str) -> int:
     return main(["service", "install", "--root", str(root), *words])
 
 
+@installs
 def test_everything_is_put_in_place_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert install(tmp_path, "--dry-run") == 0 and not files(tmp_path)
     assert install(tmp_path) == 0
@@ -37,6 +41,7 @@ def test_everything_is_put_in_place_once(tmp_path: Path, capsys: pytest.CaptureF
     assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} == {"in"}
 
 
+@installs
 def test_what_somebody_changed_is_kept(tmp_path: Path) -> None:
     install(tmp_path)
     for name in (
@@ -53,6 +58,7 @@ def test_what_somebody_changed_is_kept(tmp_path: Path) -> None:
         assert (tmp_path / name).read_text() == "mine"
 
 
+@installs
 def test_removing_leaves_the_configuration_and_what_is_not_ours(tmp_path: Path) -> None:
     install(tmp_path)
     (tmp_path / "usr/local/bin/devin").unlink()
@@ -71,6 +77,14 @@ def test_an_environment_that_the_service_cannot_see_is_refused(
     monkeypatch.setattr(os, "geteuid", lambda: 0)
     assert main(["service", "install"]) == 1
     assert "does not see /home; install SIOMS into /opt/sioms" in capsys.readouterr().err
+
+
+def test_an_environment_in_a_path_with_a_space_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "prefix", str(tmp_path / "my lab"))
+    assert install(tmp_path) == 1 and not files(tmp_path)
+    assert "my lab contains a space" in capsys.readouterr().err
 
 
 def test_only_root_may(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
