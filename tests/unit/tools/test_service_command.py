@@ -11,7 +11,6 @@ import pytest
 from sioms.tools import service
 from sioms.tools.front import main
 
-
 installs = pytest.mark.skipif(" " in sys.prefix, reason="an environment in a path with a space is refused")
 
 
