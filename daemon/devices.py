@@ -6,7 +6,6 @@ import errno
 import fcntl
 import mmap
 import os
-import select
 import signal
 import socket
 import time
@@ -16,7 +15,7 @@ from enum import Enum
 from functools import partial
 from typing import Any, Protocol
 
-from sioms.descriptors import receive
+from sioms.descriptors import is_readable, receive
 from sioms.protocol.driver_verbs import FROM_DRIVER, InUse, LinkChanged, Ready, Shutdown
 from sioms.protocol.flags import PageState
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage
@@ -387,7 +386,7 @@ class DriverProcess:
     def _why_ended(self) -> str:
         if not self.process:
             return "its driver process ended"
-        if self._pidfd >= 0 and select.select([self._pidfd], [], [], 0)[0]:
+        if self._pidfd >= 0 and is_readable(self._pidfd):
             return f"process {self.process} ended, and with it every device in it"
         return f"its driver ended, in process {self.process}"
 

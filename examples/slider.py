@@ -20,6 +20,8 @@ def main(node: str) -> None:
         channel = axis.info.channels[0]
         low, high = channel.minimum or 0.0, channel.maximum or 1.0
         target = axis.read().position[0]
+        keys = select.poll()
+        keys.register(sys.stdin, select.POLLIN)
         tty.setcbreak(sys.stdin)
         try:
             while True:
@@ -30,7 +32,7 @@ def main(node: str) -> None:
                     end="",
                     flush=True,
                 )
-                if not select.select([sys.stdin], [], [], 0.05)[0]:
+                if not keys.poll(50):
                     continue
                 for key in os.read(sys.stdin.fileno(), 64).decode(errors="replace"):
                     if key == "q":

@@ -1,9 +1,26 @@
-"""Descriptors that come over a socket, as what they are: ours, and of no program that we start."""
+"""Descriptors: received as ours and of no program that we start; waited for, whatever their number."""
 
 from __future__ import annotations
 
+import errno
+import os
+import select
 import socket
+import time
 from array import array
+from collections.abc import Iterable
+from typing import Protocol, TypeVar
+
+
+class HasDescriptor(Protocol):
+    """A file, a socket, a node."""
+
+    def fileno(self) -> int:
+        """Return the descriptor."""
+        ...
+
+
+Source = TypeVar("Source", bound=int | HasDescriptor)
 
 
 def receive(sock: socket.socket, most_bytes: int, most_fds: int) -> tuple[bytes, list[int]]:
@@ -31,3 +48,46 @@ def has_ended(sock: socket.socket) -> bool:
         return False
     except OSError:
         return True
+
+
+def readable(sources: Iterable[Source], wait_s: float | None) -> list[Source]:
+    """Wait until something can be read from one of these, or one has ended; return all of which that is true.
+
+    ``select.select`` raises ValueError for a descriptor of 1024 or more, which every process of a large cell has.
+
+    Args:
+        wait_s: how long to wait [s]; 0: not at all, None: without end. While less than 1 ms is left nothing wakes.
+
+    Raises:
+        OSError: one of them is closed.
+    """
+    return _ready(list(sources), select.POLLIN, wait_s)
+
+
+def is_readable(source: int | HasDescriptor, wait_s: float | None = 0) -> bool:
+    """Tell whether something can be read from this, or it has ended; otherwise as ``readable``."""
+    return bool(_ready([source], select.POLLIN, wait_s))
+
+
+def is_writable(source: int | HasDescriptor, wait_s: float | None = 0) -> bool:
+    """Tell whether this takes something, has connected, or has failed to; otherwise as ``readable``."""
+    return bool(_ready([source], select.POLLOUT, wait_s))
+
+
+def _ready(sources: list[Source], events: int, wait_s: float | None) -> list[Source]:
+    poll = select.poll()
+    for source in sources:
+        poll.register(source, events)
+    if wait_s is None:
+        found = poll.poll()
+    else:
+        until_s = time.monotonic() + wait_s
+        found = poll.poll(int(wait_s * 1e3))
+        left_s = until_s - time.monotonic()
+        if not found and left_s > 0:
+            time.sleep(min(left_s, 1e-3))
+            found = poll.poll(0)
+    if any(event & select.POLLNVAL for _, event in found):
+        raise OSError(errno.EBADF, os.strerror(errno.EBADF))
+    ready = {fd for fd, _ in found}
+    return [source for source in sources if (source if isinstance(source, int) else source.fileno()) in ready]

@@ -10,7 +10,6 @@ import _socket
 import importlib.util
 import os
 import random
-import select
 import socket
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -33,6 +32,7 @@ from sioms.client import shown
 from sioms.client.channel import Call, Channel
 from sioms.client.local import LocalPage
 from sioms.client.node_core import NodeCore
+from sioms.descriptors import is_readable
 from sioms.motion import AxisSettings, DriveAction
 from sioms.protocol.driver_verbs import Attach, DriverVerb
 from sioms.protocol.flags import Access, ControlMode, NodeClass, Request, Right
@@ -272,7 +272,7 @@ class World:
         assert self._run is not None
         if timeout_ms == 0:
             ready[0] = CONTROL
-            return len(select.select([self.runtime._control], [], [], 0)[0])
+            return int(is_readable(self.runtime._control))
         ready[0] = 1 if self.runtime._timer.expired else 2  # type: ignore[attr-defined]
         return 1 if ready[0] == 1 or self._run.record.announced else 0
 

@@ -13,7 +13,6 @@ import contextlib
 import gc
 import os
 import random
-import select
 import socket
 import sys
 import tempfile
@@ -24,6 +23,7 @@ from typing import Any, NamedTuple
 from ownership_cell import Cell, _of_clients, cells
 from ownership_fakes import CLOCK, DEVICES_TABLE, FIRST_UID, GRANTS, LEASE_S, PROCESSES, Client
 
+from sioms.descriptors import is_readable
 from sioms.protocol.messages import MAX_PACKET, ClientVerb, HandleVerb, decode, encode
 from sioms.protocol.records import BINARY_WRITE
 
@@ -301,7 +301,7 @@ class BitCell(Cell):
 
 
 def _is_readable(sock: socket.socket) -> bool:
-    return bool(select.select([sock], [], [], 0)[0])
+    return is_readable(sock)
 
 
 # --- going through all -------------------------------------------------------------------------------------

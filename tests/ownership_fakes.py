@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import os
-import select
 import socket
 import zlib
 from collections.abc import Mapping, Sequence
@@ -15,6 +14,7 @@ import msgspec
 
 import sioms.sdk.fork_server
 from sioms.daemon.loop import Loop
+from sioms.descriptors import is_readable
 from sioms.motion import AxisBank, AxisSettings
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.messages import MAX_PACKET, ClientVerb, decode, encode
@@ -300,9 +300,7 @@ class Process:
     def turn(self) -> None:
         """Serve what the daemon has sent."""
         control = self.runtime._control
-        while control.is_behind or (
-            self.runtime._callbacks.get(control.fileno()) and select.select([control], [], [], 0)[0]
-        ):
+        while control.is_behind or (self.runtime._callbacks.get(control.fileno()) and is_readable(control)):
             self.runtime._control_readable()
 
     def tick(self, after_ns: int = 0) -> None:

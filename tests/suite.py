@@ -235,7 +235,7 @@ def run_step(name: str, command: list[str], *, beside: bool = False) -> int:
         try:
             output = cast("IO[bytes]", process.stdout).fileno()
             while True:
-                if select.select([output], [], [], 1.0)[0]:
+                if select.select([output], [], [], 1.0)[0]:  # noqa: TID251 - imports nothing of SIOMS
                     data = os.read(output, 65536)
                     if not data:
                         return process.wait()

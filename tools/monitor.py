@@ -9,7 +9,6 @@ from __future__ import annotations
 import argparse
 import errno
 import os
-import select
 import shutil
 import signal
 import sys
@@ -24,6 +23,7 @@ from typing import Any
 
 from sioms.client.stopping import emergency_stop
 from sioms.client.workcell import NodeEntry, Workcell, is_part
+from sioms.descriptors import is_readable
 from sioms.protocol.flags import READONLY
 
 from . import monitor_jog
@@ -212,7 +212,7 @@ class Monitor:
             view = replace(view, events=tuple(self._history.lines), history=self._shows_history)
             lines, self._scroll = screen(view, size.columns, size.lines, self._scroll)
             _paint(lines)
-            if select.select([0], [], [], FRAME_S)[0]:
+            if is_readable(0, FRAME_S):
                 typed = os.read(0, 256).decode("utf-8", "replace")
                 if not typed:
                     return

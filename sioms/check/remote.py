@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import random
-import select
 import shutil
 import socket
 import tempfile
@@ -16,6 +15,7 @@ from typing import Self
 
 from sioms.children import Process
 from sioms.client.keys import VARIABLE, Folder
+from sioms.descriptors import readable
 
 
 def free_ports() -> int:
@@ -184,11 +184,11 @@ class Relay:
     def _run(self) -> None:
         while not self._ending:
             try:
-                readable, _, _ = select.select([*self._listeners, *list(self._pairs)], [], [], 0.001)
+                ready = readable([*self._listeners, *list(self._pairs)], 0.001)
             except (OSError, ValueError):  # cut meanwhile
                 continue
             with self._lock:
-                for sock in readable:
+                for sock in ready:
                     if sock in self._listeners:
                         self._accept(sock)
                     elif sock in self._pairs:

@@ -6,11 +6,11 @@ It says ``ready PORT`` and obeys ``report`` on standard input: the state of the 
 from __future__ import annotations
 
 import argparse
-import select
 import sys
 import time
 from pathlib import Path
 
+from sioms.descriptors import readable
 from sioms.simulation.control import obey
 
 from .ends import Host, TcpHost, make_ends
@@ -48,7 +48,7 @@ def _turn(host: Host, replay: Replay) -> bool:
     for data in replay.due(now_ns):
         host.write(data)
     wait_s = LONGEST_S if replay.next_ns is None else min(LONGEST_S, max(0, replay.next_ns - now_ns) / 1e9)
-    for fd in select.select([0, *host.fds()], [], [], wait_s)[0]:
+    for fd in readable([0, *host.fds()], wait_s):
         if fd == 0:
             line = sys.stdin.readline()
             if not line:

@@ -10,7 +10,6 @@ import itertools
 import json
 import os
 import re
-import select
 import shutil
 import signal
 import subprocess
@@ -24,6 +23,7 @@ from typing import Any, Self
 
 from sioms.children import ends_with_us
 from sioms.client.workcell import Workcell, is_part
+from sioms.descriptors import is_readable
 from sioms.protocol.flags import READONLY, AxisStatus, ControlMode, NodeClass
 
 from .daemon import Daemon
@@ -96,7 +96,7 @@ class Peer:
         out = self._process.stdout
         while b"\n" not in self._rest:
             left = deadline - time.monotonic()
-            if out is None or left <= 0 or not select.select([out], [], [], left)[0]:
+            if out is None or left <= 0 or not is_readable(out, left):
                 raise Unanswered(f"{self.what}: no answer within {timeout_s:g} s")
             data = os.read(out.fileno(), 65536)
             if not data:

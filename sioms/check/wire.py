@@ -19,7 +19,6 @@ import contextlib
 import ctypes
 import json
 import os
-import select
 import signal
 import sys
 import time
@@ -27,6 +26,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
+from sioms.descriptors import readable
 from sioms.simulation.control import obey
 
 from .bending import Bender, Faults, Piece, Way
@@ -114,8 +114,7 @@ class Wire:
         until_ns = [t for t in (self.to_device.next_ns, self.to_host.next_ns, self._babble[1] or None) if t]
         wait_s = min([LONGEST_S, *(max(0, t - now_ns) / 1e9 for t in until_ns)])
         hosts, devices = self.host.fds(), self.device.fds()
-        ready, _, _ = select.select([0, *hosts, *devices], [], [], wait_s)
-        for fd in ready:
+        for fd in readable([0, *hosts, *devices], wait_s):
             if fd in hosts:
                 self._from_host(fd)
             elif fd in devices:

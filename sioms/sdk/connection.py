@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import select
 import socket
 import termios
 from collections.abc import Callable
@@ -12,6 +11,8 @@ from io import FileIO
 from pathlib import Path
 
 import serial
+
+from sioms.descriptors import is_writable
 
 from .datagram import Datagrams, split_address
 from .locks import PortLock
@@ -59,7 +60,7 @@ class Connection:
         """Tell whether a TCP connection has come about; raises OSError when it was refused."""
         if self._sock is None:
             return True
-        if not select.select([], [self._sock], [], 0)[1]:
+        if not is_writable(self._sock):
             return False
         error = self._sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
         if error:

@@ -21,7 +21,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
-from sioms.descriptors import receive
+from sioms.descriptors import is_readable, receive
 from sioms.protocol.driver_verbs import TO_FORK_SERVER, Describe, Spawn
 from sioms.protocol.messages import MAX_UNPACKED, encode, pack_compressed, refusal, reply
 from sioms.protocol.verbs import take
@@ -172,7 +172,7 @@ class Hosts:
             fds: for its first device: what a new process closes, as they are not its own.
         """
         host = self._hosts.get(name)
-        if host is not None and select.select([host.pidfd], [], [], 0)[0]:
+        if host is not None and is_readable(host.pidfd):
             self._drop(name)
             host = None
         if host is None:

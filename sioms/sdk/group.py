@@ -20,7 +20,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sioms.descriptors import receive
+from sioms.descriptors import is_readable, receive
 from sioms.native.language import library
 from sioms.native.system import MOST_EVENTS
 from sioms.protocol.driver_verbs import TO_FORK_SERVER, Spawn
@@ -172,7 +172,7 @@ class Group:
     def _take(self, sock: socket.socket) -> None:
         """Take a device that the fork server sends; all that come first, for none ticks then."""
         first = True
-        while first or (not self._members and select.select([sock], [], [], 0)[0]):
+        while first or (not self._members and is_readable(sock)):
             first = False
             try:
                 packet, fds = receive(sock, 1 << 20, 8)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import pty
 import re
-import select
 import signal
 import subprocess
 import time
@@ -17,6 +16,7 @@ from daemon_rig import Client, Daemon, daemons, wait_for
 from shell_rig import BIN, CELL, Shell, environment, good, halted, refused
 
 import sioms
+from sioms.descriptors import is_readable
 
 AXIS_LINE = r"[0-3] [01] -?\d\.\d{4}e[+-]\d\d -?\d\.\d{4}e[+-]\d\d -?\d\.\d\de[+-]\d\d"
 
@@ -325,7 +325,7 @@ class MonitorTerminal:
             self.look()
 
     def look(self) -> None:
-        if select.select([self.terminal], [], [], 0.1)[0]:
+        if is_readable(self.terminal, 0.1):
             self.seen.extend(os.read(self.terminal, 65536))
 
     def press(self, keys: bytes) -> None:
@@ -466,7 +466,7 @@ def test_a_stopped_monitor_gives_the_terminal_back(shell: Shell, no_color: str) 
         deadline = time.monotonic() + 30.0
         while until not in seen:
             assert time.monotonic() < deadline, seen[-300:]
-            if select.select([terminal], [], [], 0.1)[0]:
+            if is_readable(terminal, 0.1):
                 seen += os.read(terminal, 65536)
 
     try:

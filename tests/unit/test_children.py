@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import os
-import select
 import signal
 import subprocess
 import sys
@@ -14,6 +13,7 @@ import pytest
 from daemon_rig import wait_for
 
 from sioms.children import KEPT, Process
+from sioms.descriptors import is_readable
 
 TREE = Path(__file__).resolve().parents[2]
 PARENT = """
@@ -41,7 +41,7 @@ def test_a_child_ends_with_a_parent_that_is_killed() -> None:
         child = os.pidfd_open(int(parent.stdout.readline()))
         parent.kill()
         parent.wait()
-        assert select.select([child], [], [], 30.0)[0], "the child lives on"
+        assert is_readable(child, 30.0), "the child lives on"
     os.close(child)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import select
 import socket
 from collections.abc import Iterator
 from itertools import pairwise
@@ -11,6 +10,7 @@ from typing import Any
 
 import pytest
 
+from sioms.descriptors import is_readable, is_writable
 from sioms.sdk.connected import LONGEST_PAUSE_NS, Connected
 from sioms.sdk.settings import LineSettings
 
@@ -68,11 +68,11 @@ def test_a_port_that_accepts_and_closes_is_tried_less_and_less_often(port: socke
         told = runtime.told
         up = engine.connect(runtime.now)
         if accepts and engine._connecting is not None:
-            select.select([], [engine._connecting.fd], [], 5.0)
+            is_writable(engine._connecting.fd, 5.0)
             up = engine.connect(runtime.now)
         if up:
             port.accept()[0].close()
-            select.select([engine.line.connection.fd], [], [], 5.0)  # type: ignore[union-attr]
+            is_readable(engine.line.connection.fd, 5.0)  # type: ignore[union-attr]
             engine._readable()
             assert engine.line is None
         if runtime.told > told:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import select
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -12,6 +11,7 @@ from typing import Any
 import msgspec
 import pytest
 
+from sioms.descriptors import is_readable
 from sioms.sdk.connection import Connection
 from sioms.sdk.datagram import Datagrams
 from sioms.sdk.exchange import DeviceError, Exchange, LinkError, SideExchange, Steps
@@ -21,7 +21,7 @@ from sioms.sdk.side_connection import SideConnection
 
 
 def readable(fd: Any, wait_s: float = 2.0) -> None:
-    assert select.select([fd], [], [], wait_s)[0], "nothing came"
+    assert is_readable(fd, wait_s), "nothing came"
 
 
 @pytest.fixture
@@ -53,7 +53,7 @@ def test_datagrams_keep_their_bounds_and_strangers_are_counted(device: socket.so
             readable(line)
             assert [line.read(), line.read()] == [b"one", b"two"]
             assert line.read() == b"" and len(strangers) == 1 + 16, "others have their turn in a flood"
-            while select.select([line], [], [], 0)[0]:
+            while is_readable(line):
                 assert line.read() == b""
             assert len(strangers) == 41
     finally:
@@ -222,7 +222,7 @@ def test_what_was_given_up_is_not_answered_later(server: socket.socket) -> None:
         side.begin(exchange, 0)
         assert side.advance(1) is None
         made = server.accept()[0]
-        while not select.select([made], [], [], 0.001)[0]:
+        while not is_readable(made, 0.001):
             assert side.advance(2) is None
         assert made.recv(100) == exchange.data
         return made

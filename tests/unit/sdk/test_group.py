@@ -1,12 +1,12 @@
 """Several devices in one process: what one of them raises, wherever, ends that one, and the others tick on."""
 
 import os
-import select
 import socket
 from types import SimpleNamespace
 
 import pytest
 
+from sioms.descriptors import is_readable
 from sioms.sdk.group import CALLED, CAN_WAIT, STANDS, STOPS, Group, Member
 
 
@@ -104,7 +104,7 @@ def test_one_that_has_ended_is_waited_for_no_more(group):
     member.runtime.running = False
     group._serve(member.runtime.poll_fd, member)
     assert member.runtime.did[-1] == "released"
-    assert not group._members and not select.select([group._epoll.fileno()], [], [], 0)[0]
+    assert not group._members and not is_readable(group._epoll.fileno())
 
 
 def test_what_has_more_to_do_is_served_without_an_event(group):

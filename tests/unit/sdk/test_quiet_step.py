@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from served_writes_rig import Served, queue_of
 
+from sioms.descriptors import is_readable
 from sioms.native.language import library
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.messages import decode_reply
@@ -192,7 +193,7 @@ def test_ticks_go_on_until_something_else_is_ready(make):
     os.eventfd_write(device.other, 1)
     assert run(device.quiet) == 1, "the other is the loop's"
     assert device.ready[0] == device.other and not device.quiet.left
-    assert len(device.ticks) == 2 and not select.select([device.timer], [], [], 0)[0]
+    assert len(device.ticks) == 2 and not is_readable(device.timer)
     device.answer = 1
     os.eventfd_write(device.timer, 1)
     assert run(device.quiet) == 2, "both are the loop's"
@@ -204,10 +205,10 @@ def test_a_missed_tick_makes_both_timers_ready_and_is_made_up_for(make):
     device = make(lead_ns=200_000, expired=0, scheduled_ns=begin_ns, announced=1)
     os.eventfd_write(device.timer, 2)
     quiet_step.set_timer(device.line.fd, begin_ns + PERIOD_NS)
-    select.select([device.line.fd], [], [], 10.0)
+    is_readable(device.line.fd, 10.0)
     assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
     if device.quiet.announced:  # the slack of the later ones came after the tick
-        select.select([device.line.fd], [], [], 10.0)
+        is_readable(device.line.fd, 10.0)
         assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
     assert device.ticks[-1][0] == begin_ns + 3 * PERIOD_NS and device.quiet.scheduled_ns == begin_ns + 3 * PERIOD_NS
 
@@ -295,7 +296,7 @@ def test_a_stop_has_a_tick_soon_but_not_sooner_than_a_quarter_of_a_period(make):
     assert not device.quiet.early_ns, "the next one comes as soon"
     device.quiet.early_ns = 1
     quiet_step.set_timer(device.line.fd, 1)
-    select.select([device.line.fd], [], [], 10.0)
+    is_readable(device.line.fd, 10.0)
     device.ready[0] = device.line.fd
     assert heed(device.quiet, 1) and not device.quiet.waiting
     assert len(device.ticks) == 1 and device.quiet.scheduled_ns == last_ns and device.quiet.ticked_ns > last_ns
@@ -306,7 +307,7 @@ def test_a_slack_before_the_tick_announces_it(make):
     os.eventfd_write(device.timer, 1)
     assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
     assert (device.slacks, device.ticks, device.quiet.announced) == (1, [], 1)
-    select.select([device.line.fd], [], [], 10.0)
+    is_readable(device.line.fd, 10.0)
     device.ready[0] = device.line.fd
     assert heed(device.quiet, 1) == DONE
     assert len(device.ticks) == 1 and device.quiet.announced == 0 and device.slacks == 1
@@ -419,7 +420,7 @@ def test_who_subscribed_is_woken_every_so_many_publications():
         for number in range(7):
             publish(made, number, number, number)
             for i, (r, _) in enumerate(pipes):
-                if select.select([r], [], [], 0)[0]:
+                if is_readable(r):
                     woken.append((number, i))
                     os.read(r, 8)
         assert woken == sorted([*((n, 0) for n in range(7)), (2, 1), (5, 1)])

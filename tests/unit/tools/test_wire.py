@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import select
 import socket
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import pytest
 
 from sioms.check.bending import Bender, Faults, Piece, Way
 from sioms.check.ends import make_ends
+from sioms.descriptors import readable
 
 MESSAGE = bytes(range(20))
 
@@ -103,11 +103,11 @@ def test_what_a_device_pushes_goes_on_to_the_driver_until_the_cable_is_pulled() 
         name, _, number = host.name.rpartition(":")
         driver.bind((name, int(number)))
         driver.settimeout(2.0)
-        assert host.fds() == [] and select.select(device.fds(), [], [], 0)[0] == []
+        assert host.fds() == [] and readable(device.fds(), 0) == []
         for plugged in (True, False, True):
             (host.plug if plugged else host.unplug)()
             sensor.sendto(MESSAGE, ("127.0.0.1", port))
-            (fd,) = select.select(device.fds(), [], [], 2.0)[0]
+            (fd,) = readable(device.fds(), 2.0)
             data = device.read(fd)
             assert data == MESSAGE
             host.write(data + bytes((plugged,)))
