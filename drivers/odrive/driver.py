@@ -39,6 +39,7 @@ from .codec import CLOSED_LOOP, HOMING, IDLE, confirmed
 
 MODES = BANK_MODES | POSITION_MODES | ControlMode.VELOCITY | ControlMode.FORCE
 OLDEST = (0, 5, 1)
+BROKEN_OFF = "the homing was broken off, by another master or a request of idle; RESET, then HOME again"
 """Before it positions were encoder counts."""
 KNOWN = (0, 5)
 PARTS = ("motor", "encoder", "controller")
@@ -112,6 +113,7 @@ class OdriveUnit(AxesUnit):
         self._timeout_s = settings.timeout_s + 80 * n * self._character_s
         self._uptime = Uptime(0.001, 2**32, digits=9)
         self._homes = [False] * n
+        self._broken_off = [False] * n
         self._may_hold = [False] * n
         self._is_idle = [False] * n
         self._fixed: list[dict[str, float]] = [{} for _ in range(n)]
@@ -236,7 +238,9 @@ class OdriveUnit(AxesUnit):
         yield from self._ready(axis)
         number = self._numbers[axis]
         self._set[axis] = {}
-        yield odrive.exchange([f"w axis{number}.requested_state {HOMING}"], [f"f {number}"], self._timeout_s)
+        homed, begin = f"axis{number}.is_homed", f"w axis{number}.requested_state {HOMING}"
+        yield confirmed([f"w {homed} 0"], [(homed, 0.0)], self._timeout_s, repeatable=True)
+        yield odrive.exchange([begin], [f"f {number}"], self._timeout_s)
         self._homing_since_ns[axis] = self.clock()
         self._homes[axis] = True
 
@@ -244,6 +248,7 @@ class OdriveUnit(AxesUnit):
         """Clear the board's errors and close the loop again."""
         number = self._numbers[axis]
         yield odrive.exchange([f"u {number}", "sc"], [f"f {number}"], self._timeout_s)
+        self._broken_off[axis] = False
         yield from self._close_loop(axis)
         (bits,), (state,) = yield odrive.read([f"axis{number}.error", f"axis{number}.current_state"], self._timeout_s)
         yield from self._judge(axis, int(bits), int(state))
@@ -448,8 +453,11 @@ class OdriveUnit(AxesUnit):
         if bits:
             self._homes[axis], moving[axis] = False, False
         elif state != HOMING and self.clock() - self._homing_since_ns[axis] > SWITCH_ON_NS:
-            self._homes[axis], moving[axis], done[axis] = False, False, True
-            yield from self._close_loop(axis)
+            ((homed,),) = yield odrive.read([f"axis{self._numbers[axis]}.is_homed"], self._timeout_s)
+            self._homes[axis], moving[axis], done[axis] = False, False, bool(homed)
+            self._broken_off[axis] = not homed
+            if homed:
+                yield from self._close_loop(axis)
 
     def _judge(self, axis: int, bits: int, state: int) -> Steps:
         """Say why an axis cannot move; the details are read once a change."""
@@ -459,7 +467,9 @@ class OdriveUnit(AxesUnit):
             details = [(f"{part}.error", int(value[0])) for part, value in zip(PARTS, values, strict=True)]
             self._faults[axis] = odrive.error_text(number, bits, details)
         self._errors[axis] = bits
-        if not bits:
+        if not bits and self._broken_off[axis]:
+            self._faults[axis] = BROKEN_OFF
+        elif not bits:
             settled = self.clock() - self._closed_ns[axis] > SWITCH_ON_NS
             off = self._may_hold[axis] and settled and state == IDLE and not self._homes[axis]
             self._faults[axis] = "the axis is idle; check its calibration" if off else ""

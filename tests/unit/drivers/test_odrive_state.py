@@ -11,6 +11,7 @@ from drive_rig import LIMITS, Joined
 
 from sioms.drivers.odrive import simulator as odrive
 from sioms.drivers.odrive.driver import Odrive
+from sioms.drivers.odrive.simulated.axis import HOMING
 from sioms.drivers.odrive.simulator import CLOSED_LOOP, IDLE
 from sioms.motion import ActionKind, DriveAction
 from sioms.protocol.flags import AxisStatus
@@ -385,10 +386,34 @@ def test_a_restart_while_the_link_is_lost_is_noticed_by_the_opening() -> None:
     run(rig, 1.0)  # and is not told again
 
 
-def test_homing_turns_back_from_the_switch_and_holds() -> None:
+def homing_rig() -> Joined:
     axis = {"name": "x", "number": 0, "travel_per_turn": TURN, "force_max": 400.0, "homing": True, **LIMITS}
     rig = Joined(Odrive, {"axis": [axis]}, lambda clock: odrive.Board(clock=clock))
     rig.do(rig.unit.open())
+    return rig
+
+
+@pytest.mark.parametrize("state", [IDLE, CLOSED_LOOP])
+def test_a_homing_that_another_master_ends_is_no_home(state: int) -> None:
+    """The board leaves the state without an error, also when an earlier homing has succeeded."""
+    rig = homing_rig()
+    rotor = rig.device.axes[0]
+    rotor.p["is_homed"] = 1
+    rig.device.handlers()["switch"]("-2")
+    rig.do(rig.unit.home(0))
+    run(rig, 0.3)
+    assert rotor.p["current_state"] == HOMING and rotor.place < -0.01
+    rotor.p["requested_state"] = state
+    run(rig, 1.0)
+    assert "broken off" in rig.unit._faults[0]
+    rig.unit.bank._queue.latched[0] = 0  # as the kit does first
+    rig.do(rig.unit.reset(0))
+    run(rig, 0.1)
+    assert not rig.unit._faults[0] and rotor.p["current_state"] == CLOSED_LOOP
+
+
+def test_homing_turns_back_from_the_switch_and_holds() -> None:
+    rig = homing_rig()
     rotor = rig.device.axes[0]
     rig.device.handlers()["switch"]("-2")
     rig.do(rig.unit.home(0))
