@@ -93,6 +93,8 @@ def packets(chance: random.Random) -> Iterator[tuple[bytes, bool]]:
         seconds = chance.choice([*[0.0] * 12, *[None, 0, 3, 2.5] * 2, float("nan"), float("inf"), -1.0, 300, -1])  # type: ignore[list-item]
         flags = chance.choice([*[0, 1] * 6, 2, 3, 127, 128, -1])
         packet = encode(chance.choice([*[1] * 12, 2, 4]), number, flags, seconds, data)
+        if chance.random() < 0.1:
+            packet = encode(chance.choice([7, 7, 7, 3]), chance.choice([0, 0, 1]), chance.choice([0, 1, number, -1]))
         usual = seconds != float("inf") and (type(seconds) is not int or 0 <= seconds < 128)
         match chance.randrange(12):
             case 0:
@@ -131,7 +133,7 @@ class Served:
         self.desk = Desk(
             plain=plain_of(queue), count=1, fds=row(self.theirs.fileno(), count=MOST_WRITERS),
             first=row(1, count=MOST_WRITERS), known=row(len(AXES), count=MOST_WRITERS), axes=row(1, *AXES, count=4),
-            request=request, word=0, changed=changed_ns(request), gives_way=0,
+            heard=row(count=MOST_WRITERS), request=request, word=0, changed=changed_ns(request), gives_way=0,
             packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, size=row(), writer=row(), came=row(),
             effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0,
             reply=np.zeros(REPLY, dtype=np.uint8),

@@ -208,11 +208,16 @@ class Attachments:
         self._guarded(handle, work_in)
         self._turns.charge(handle.sock.fileno(), took_ns)
 
+    def heard(self, handle: Handle, at_ns: int) -> None:
+        """Let a lease run from when a client said something, which has been; never from earlier than before."""
+        handle.heard_ns = max(handle.heard_ns, at_ns) if handle.passed_on else at_ns
+        handle.passed_on = True
+
     def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes) -> None:
         if isinstance(message, verbs.Keepalive):
             return
         if isinstance(message, verbs.Heard):
-            _hear(handle, message.at_ns)
+            self.heard(handle, min(message.at_ns, handle.came_ns))
             return
         if isinstance(message, verbs.Part):
             _keep_part(handle, message)
@@ -305,13 +310,6 @@ class Attachments:
         self._halt_all([handle])
         handle.close()
         self._tell(Detached(handle.number))
-
-
-def _hear(handle: Handle, at_ns: int) -> None:
-    """Let a lease run from when a client said something; never from later than now, nor from earlier than before."""
-    at_ns = min(at_ns, handle.came_ns)
-    handle.heard_ns = max(handle.heard_ns, at_ns) if handle.passed_on else at_ns
-    handle.passed_on = True
 
 
 def _keep_part(handle: Handle, message: verbs.Part) -> None:

@@ -52,7 +52,7 @@ class WriteDesk:
 
         self.record = Desk(
             plain=plain, count=0, fds=row(MOST_WRITERS), first=row(MOST_WRITERS), known=row(MOST_WRITERS),
-            axes=row(axes[0].n), request=request, word=0, changed=0, gives_way=int(gives_way),
+            axes=row(axes[0].n), heard=row(MOST_WRITERS), request=request, word=0, changed=0, gives_way=int(gives_way),
             packets=self._packets, kept=0, size=row(MOST_KEPT), writer=row(MOST_KEPT),
             came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
             replace=0, at=0, records=0, reply=np.zeros(REPLY, dtype=np.uint8),
@@ -87,8 +87,12 @@ class WriteDesk:
                 first += 1
 
     def take_back(self, tick: int) -> None:
-        """Work in the writes that have been served; ``tick``: that their answers have told."""
+        """Work in what has been served: writes, whose answers have told ``tick``, and words of gateways."""
         record = self.record
+        for i in range(record.count):
+            if heard_ns := int(record.heard[i]):
+                record.heard[i] = 0
+                self._clients.heard(self._writers[i], heard_ns)
         kept, record.kept = record.kept, 0
         for i in range(kept):
             packet = bytes(self._packets[i * ROOM : i * ROOM + record.size[i]])

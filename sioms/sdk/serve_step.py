@@ -1,4 +1,5 @@
-"""The usual write of a client, served by steps: taken off its socket, judged, acknowledged, and kept for the bank.
+"""The usual write of a client, served by steps: taken off its socket, judged, acknowledged, and kept for the bank; and
+what a gateway says ahead of one: how old the word of its client is.
 
 What is not the plain case stays in the socket, untouched, for the loop (attachments.py): it is the only one that
 refuses. A write that is kept here is worked in by the loop before anything else happens to the bank, the next tick too.
@@ -30,6 +31,7 @@ ROOM: Final = 4096
 REPLY: Final = 40
 REPLACE: Final = int(WriteFlag.REPLACE)
 WRITE: Final = int(HandleVerb.WRITE)
+HEARD: Final = int(HandleVerb.HEARD)
 
 # MessagePack.
 FIX: Final = 0x80
@@ -40,6 +42,7 @@ BYTES_16: Final = 0xC5
 DOUBLE: Final = 0xCB
 UINT_8: Final = 0xCC
 UINT_64: Final = 0xCF
+NOTICE: Final = 0x93
 PARTS: Final = 0x95
 ANSWER: Final = 0x96
 INFINITE: Final = 0x7FF
@@ -52,6 +55,8 @@ class Desk(Record):
     ``count`` writers may be served by steps, with their sockets ``fds``, and the bank axes of each, ``known`` of
     ``axes`` from ``first`` on. ``request`` is the stop-request file, of which ``word`` and ``changed`` have been seen.
 
+    ``heard``: the instant that the newest Heard of each writer tells, never one that has yet to come; 0: none came.
+
     ``kept`` packets lie in ``packets``, each in ROOM bytes, with its ``size``, its ``writer``, when it ``came`` and
     took ``effect``, how long serving it ``took`` [ns], and whether its answer could be ``sent``; they hold
     ``waiting`` commands. ``at`` and ``records`` are the place in, and the bytes of, the packet that is looked at.
@@ -63,6 +68,7 @@ class Desk(Record):
     first: Integers
     known: Integers
     axes: Integers
+    heard: Integers
     request: int
     word: int
     changed: int
@@ -148,6 +154,16 @@ def read_write(d: Desk, end: int) -> int:
 
 
 @step
+def read_heard(d: Desk, end: int) -> int:
+    """Read a packet at ``at``, up to ``end``, as a Heard; return the instant that it tells, 0: it is something else."""
+    if end - d.at < 4 or d.packets[d.at] != NOTICE or d.packets[d.at + 1] != HEARD or d.packets[d.at + 2]:
+        return 0
+    d.at += 3
+    at_ns = take_number(d, end)
+    return at_ns if at_ns > 0 and d.at == end else 0
+
+
+@step
 def put_number(d: Desk, at: int, value: int) -> int:
     """Write a number from 0 into the reply; return where it ends."""
     if value < FIX:
@@ -214,6 +230,12 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     size = look_at_packet(d.fds[who], d.packets, begin, ROOM)
     if size <= 0 or size > ROOM:
         return 1
+    d.at = begin
+    heard_ns = read_heard(d, begin + size)
+    if heard_ns:
+        drop_packet(d.fds[who])
+        d.heard[who] = max(d.heard[who], min(heard_ns, came_ns))
+        return 0
     d.at = begin
     if not read_write(d, begin + size):
         return 1

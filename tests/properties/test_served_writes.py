@@ -4,6 +4,7 @@ import os
 import random
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -41,10 +42,20 @@ def taken(queue, packet, waiting):
     return None if commands is None else (number, len(records))
 
 
+def heard(packet):
+    """Return the instant that a packet tells, if it is a Heard as gateways send it; else 0."""
+    try:
+        number, message = verbs.take(packet, verbs.ON_HANDLE)
+    except MalformedMessage:
+        return 0
+    told = isinstance(message, verbs.Heard) and packet == message.packed(number) and not number
+    return max(0, message.at_ns) if told else 0
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_what_steps_serve_is_what_the_loop_takes_at_once(seed, request_file):
     chance = random.Random(seed)
-    made, served_count, usual_left = packets(chance), 0, 0
+    made, served_count, heard_count, usual_left = packets(chance), 0, 0, 0
     assert attachments.SHARES and verbs.ON_HANDLE.decoders
     for _ in range(400):
         queue = queue_of(chance)
@@ -54,7 +65,14 @@ def test_what_steps_serve_is_what_the_loop_takes_at_once(seed, request_file):
             if not packet:
                 continue
             wanted = taken(queue, packet, waiting)
-            if served.serve(packet):
+            if told := heard(packet):
+                before, now_ns = int(served.desk.heard[0]), time.monotonic_ns()
+                assert served.serve(packet) == (kept < MOST_KEPT) and not served.answer()
+                assert served.left() == (packet if kept == MOST_KEPT else b"")
+                least_ns = before if kept == MOST_KEPT else max(before, min(told, now_ns))
+                assert least_ns <= served.desk.heard[0] <= max(least_ns, time.monotonic_ns())
+                heard_count += 1
+            elif served.serve(packet):
                 assert wanted is not None and kept < MOST_KEPT
                 answer = served.answer()
                 desk = served.desk
@@ -71,7 +89,7 @@ def test_what_steps_serve_is_what_the_loop_takes_at_once(seed, request_file):
                     usual_left += 1
             assert (served.desk.waiting, served.desk.kept) == (waiting, kept)
         served.close()
-    assert served_count > 100 and usual_left < served_count
+    assert heard_count > 5 and served_count > 100 and usual_left < served_count
 
 
 def test_both_forms_of_the_steps_do_the_same():
@@ -109,4 +127,20 @@ def test_a_client_that_does_not_read_its_answers_is_the_loops(request_file):
             served.theirs.send(bytes(1000))
     assert not served.serve(packet)
     assert served.desk.kept == 1 and not served.desk.sent[0] and not served.left(), "it is taken, and not answered"
+    served.close()
+
+
+def test_the_word_of_a_gateway_is_taken_and_nothing_later_than_now(request_file):
+    served = Served(queue_of(random.Random(0)), request_file)
+    heard, now_ns = served.desk.heard, time.monotonic_ns()
+    for at_ns in (now_ns - 2_000_000, now_ns - 9_000_000, 5, now_ns + 10**15):
+        before = int(heard[0])
+        assert served.serve(verbs.Heard(at_ns).packed()) and not served.left() and not served.answer()
+        assert heard[0] >= before and before <= max(before, min(at_ns, now_ns)) <= heard[0] <= time.monotonic_ns()
+    assert served.desk.kept == 0, "a tick need not wait for it"
+    for at_ns in (0, -5):
+        packet = verbs.Heard(at_ns).packed()
+        assert not served.serve(packet) and served.left() == packet, "the loop judges it"
+    packet = verbs.Heard(now_ns).packed() + b"\0"
+    assert not served.serve(packet) and served.left() == packet
     served.close()

@@ -12,6 +12,7 @@ from sioms.drivers.sim.axes import SimAxes
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.journal import JournalReader, Note
 from sioms.protocol.records import AXIS_WRITE, WRITE
+from sioms.protocol.verbs import Heard
 
 LIMITS = {"position_min": -1.0, "position_max": 1.0, "velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 60.0}
 TABLE = {"axis": [{"name": f"a{i}", **LIMITS, "motor": {"mass": 1.0}} for i in range(4)]}
@@ -106,6 +107,24 @@ def test_a_served_write_renews_the_lease_and_counts_in_the_turns(make):
         world.tick()
     client.write(record(), replace=True)
     assert world.served == 2 and handle.heard_ns == heard_ns, "a gateway tells when the client said it"
+
+
+def test_steps_hand_over_what_a_gateway_says_of_its_client(make):
+    world = make(SimAxes, TABLE, 1)
+    world.by_steps = 1.0
+    client = world.open(0, [0], exclusive=True)
+    handle = world.runtime.clients.handles[client.node.handle]
+    said_ns = CLOCK.now_ns
+    CLOCK.now_ns += 50_000_000
+    client.channel.notice(Heard(said_ns).packed())
+    world.serve(client)
+    assert handle.came_ns == 0, "the loop has not served it"
+    assert (handle.heard_ns, handle.passed_on) == (said_ns, True)
+    client.write(record())
+    assert world.served == 2 and handle.heard_ns == said_ns, "what comes behind it extends nothing"
+    client.channel.notice(Heard(said_ns - 1).packed())
+    world.serve(client)
+    assert handle.heard_ns == said_ns, "nor earlier than before"
 
 
 @pytest.mark.parametrize("why", ["a wait", "writes under way", "parts", "halted", "stopped", "admits", "link", "reads"])
