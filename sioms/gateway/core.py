@@ -18,6 +18,7 @@ from sioms.protocol.clock import Wall
 from sioms.protocol.journal import JOURNAL_SIZE, pack_events
 from sioms.protocol.link import Down, MalformedFrame, Up, Update
 from sioms.protocol.messages import MalformedMessage, decode, decode_reply, refusal, reply, value_of
+from sioms.protocol.page import as_of_ns
 
 from .parts import Followed, Held, Outside, Principal, Session
 
@@ -42,7 +43,7 @@ IDLE_NODES = 16
 STATE_NS = 50_000_000
 """How often a page's state is sent when it publishes nothing."""
 URGENT_NS = 30_000_000
-"""How long after an answer snapshots are sent as they come: one of them shows what was acknowledged."""
+"""How long after an answer snapshots are sent as they come, at most: until one shows what was acknowledged."""
 LOOK_NS = 500_000
 """How often to look for them."""
 TOLD = 50
@@ -60,6 +61,16 @@ def _verb(packet: bytes) -> int:
     if packet[:1] in UNUSUAL or (packet and packet[0] & 0xF0 == 0x90):
         return int(decode(packet)[0])
     return -1
+
+
+def _effect_ns(packet: bytes) -> int:
+    """Return the instant from which readings show what an answer acknowledges [ns]; 0: nothing, or it is none, which
+    its client judges.
+    """
+    try:
+        return int(decode_reply(packet)[5])
+    except MalformedMessage:
+        return 0
 
 
 class Gateway:
@@ -296,8 +307,8 @@ class Gateway:
             self._follow(session, number, device, packet, fds)
             return
         self._outside.drop(fds)
-        self._answered(session, now_ns)
         self._send(session, Down.PACKET, body=packet)
+        self._owe(session, list(session.held.values()), message[5], now_ns)
 
     def _follow(self, session: Session, number: int, device: str, packet: bytes, fds: Sequence[int]) -> None:
         """Begin to send a journal: what it keeps goes with the answer."""
@@ -356,11 +367,18 @@ class Gateway:
     def driver_packet(self, session: Session, handle: int, packet: bytes) -> None:
         """Take a packet of the driver behind a handle."""
         now_ns = self._now()
-        self._answered(session, now_ns)
         self._send(session, Down.PACKET, handle, packet, now_ns)
+        if answered := session.held.get(handle):
+            device = answered.node.shape.device
+            same = [held for held in session.held.values() if held.node.shape.device == device]
+            self._owe(session, same, _effect_ns(packet), now_ns)
 
-    def _answered(self, session: Session, now_ns: int) -> None:
-        """Have the snapshots of a session sent as they come for a while."""
+    def _owe(self, session: Session, nodes: Sequence[Held], effect_ns: int, now_ns: int) -> None:
+        """Have the snapshots of nodes sent as they come until they show what has been acknowledged."""
+        if not effect_ns:
+            return
+        for held in nodes:
+            held.owed_ns = max(held.owed_ns, effect_ns)
         session.urgent_ns = now_ns + URGENT_NS
         session.due_ns = min(session.due_ns, now_ns + LOOK_NS)
         self.due_ns = min(self.due_ns, session.due_ns)
@@ -432,7 +450,7 @@ class Gateway:
         """Send what is new of a page, if its client keeps up; return when to look again [ns]."""
         if held.ahead >= link.WINDOW or session.held.get(held.handle) is not held:  # the session may just have ended
             return now_ns + IDLE_NS
-        urgent = session.urgent_ns > now_ns
+        urgent = held.owed_ns > 0 and session.urgent_ns > now_ns
         if not (must or urgent or held.woken) and now_ns - held.sent_ns < self._idle_ns:
             return held.sent_ns + self._idle_ns
         condition = held.node.page.condition()
@@ -453,6 +471,8 @@ class Gateway:
             last = min(head, first + most - 1)
             news = [raw for raw in map(page.numbered, range(first, last + 1)) if raw is not None]
             held.cursor, held.ahead = last, held.ahead + 1
+            if news and as_of_ns(news[-1]) >= held.owed_ns:
+                held.owed_ns = 0
             alive_ns, driver, daemon, reason = condition
             update = Update(alive_ns, driver, daemon, reason, woken and last == head, news)
             self._send(session, Down.UPDATE, held.handle, update.packed())

@@ -114,6 +114,7 @@ class Held:
         told_ns: what the driver has been told of when the client last said something.
         cursor: number of the newest snapshot that has been sent.
         ahead: frames of snapshots that are not confirmed.
+        owed_ns: the instant that the client's readings have to show, by what was acknowledged; 0: none.
         sent_ns: when the last one was sent.
         woken: whether the driver has woken us for it since.
         ended: whether its connection has ended.
@@ -127,6 +128,7 @@ class Held:
     told_ns: int = 0
     cursor: int = 0
     ahead: int = 0
+    owed_ns: int = 0
     sent_ns: int = 0
     state: tuple[int, int] = (-1, -1)
     woken: bool = False
@@ -158,7 +160,7 @@ class Session:
         heard: number of its last frame.
         heard_ns: when that came; sent_ns: when something was last sent to it.
         due_ns: when it is to be attended to at the latest.
-        urgent_ns: until when its snapshots are sent as they come.
+        urgent_ns: until when snapshots that are owed are sent as they come.
         line: to the daemon; None before the first packet.
         taken_in: whether the daemon has taken it for the key's.
         waiting: packets from before that.

@@ -12,6 +12,7 @@ from sioms.gateway.parts import Principal
 from sioms.protocol import link
 from sioms.protocol.flags import PageState
 from sioms.protocol.link import Down, Up, Update
+from sioms.protocol.messages import reply
 
 
 @pytest.fixture
@@ -97,12 +98,20 @@ def test_who_waits_for_news_or_has_been_answered_gets_them_at_once(world: World)
     world.gateway.woken(world.session(b"a"), 5)
     assert Down.UPDATE in world.kinds(b"a")[before:]
     assert Update.take(world.last(b"a", Down.UPDATE)[1], node.shape.slot_size).wake
-    world.gateway.driver_packet(world.session(b"a"), 5, b"an answer")
-    world.now_ns += MS
-    node.publish(world.now_ns)
-    before = len(world.sent[b"a"])
-    world.gateway.tick()
-    assert Down.UPDATE in world.kinds(b"a")[before:]
+    effect_ns = world.now_ns + MS
+    world.gateway.driver_packet(world.session(b"a"), 5, reply(3, 0, effect_ns))
+    for shown in (True, True, False, False):  # until the instant of the effect is shown; then with the next batch
+        before = len(world.sent[b"a"])
+        world.now_ns += MS // 2 + 1
+        node.publish(world.now_ns)
+        world.gateway.tick()
+        assert (Down.UPDATE in world.kinds(b"a")[before:]) is shown
+    for answer in (reply(4, 0), b"no answer"):
+        before = len(world.sent[b"a"])
+        world.gateway.driver_packet(world.session(b"a"), 5, answer)
+        node.publish(world.now_ns)
+        world.gateway.tick()
+        assert Down.UPDATE not in world.kinds(b"a")[before:], "a query changes no reading"
 
 
 def test_the_end_of_a_driver_is_an_end_of_file_and_its_page_tells_why(world: World) -> None:
