@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import errno
 import os
-import resource
 import signal
 import socket
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
 
+from sioms.descriptors import permit_files
 from sioms.protocol.socketpath import socket_path
 
 from .config import Config, parse
@@ -27,8 +27,6 @@ from .stop_record import StopRecord
 
 PRIORITY = 50
 """SCHED_FIFO priority of the daemon: that of a driver, so that it gets its turn whenever a tick is done."""
-MOST_FILES = 65536
-"""Descriptors that the daemon asks for, as far as it may: some three for each session and handle."""
 
 
 def serve(config_path: str, given_path: str | None, level: str, process: ForkServerProcess) -> int:
@@ -58,8 +56,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: ForkSer
         )
         return 1
     _become_prompt(log)
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, MOST_FILES)), hard))
+    permit_files()
     try:
         server = Server(loop, listening, config_path, log, record, process)
     except OSError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import select
 import socket
 import time
@@ -48,6 +49,18 @@ def has_ended(sock: socket.socket) -> bool:
         return False
     except OSError:
         return True
+
+
+MOST_FILES = 65536
+"""What a process that serves many permits itself, where its hard limit does: a session or handle takes the daemon some
+three, a device some thirty.
+"""
+
+
+def permit_files() -> None:
+    """Raise this process's limit of open files to what it may have, at most ``MOST_FILES``."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, MOST_FILES)), hard))
 
 
 def readable(sources: Iterable[Source], wait_s: float | None) -> list[Source]:

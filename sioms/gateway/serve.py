@@ -15,6 +15,7 @@ from functools import partial
 
 from sioms.client.keys import Folder
 from sioms.client.wall import wall
+from sioms.descriptors import permit_files
 from sioms.ending import on_end
 from sioms.notify import ServiceManager
 from sioms.protocol.clock import Wall
@@ -223,6 +224,7 @@ def serve(path: str, folder: Folder, *, zmq: tuple[str, int] | None, zenoh: tupl
     Raises:
         OSError: with a sentence: a place that is taken or not ours, no certificate.
     """
+    permit_files()
     gateway = Serve(path, folder)
     if zmq is not None:
         from .zeromq import ZeroMq

@@ -36,6 +36,7 @@ from .ways import Ways
 if TYPE_CHECKING:
     from .transport import Loop
 
+HANDSHAKE_MS = 2000
 TURN = 200
 """Frames of clients that are taken before others have their turn."""
 MOST_QUEUED = 1000
@@ -122,10 +123,11 @@ class Zenoh:
         limit = {
             "flows": ["ingress"], "messages": ["put"], "key_exprs": ["**"], "size_limit": link.MAX_TO_GATEWAY
         }  # fmt: skip
+        at = f"{endpoint(host, port)}#tls_handshake_timeout_ms={HANDSHAKE_MS}"
         try:
             self._session = zenoh.open(
                 config(
-                    folder, "listen", mode="router", listen={"endpoints": [endpoint(host, port)]},
+                    folder, "listen", mode="router", listen={"endpoints": [at]},
                     low_pass_filter=[limit], access_control=access(),
                 )
             )  # fmt: skip

@@ -7,6 +7,7 @@ Concurrency: the thread of the loop.
 from __future__ import annotations
 
 import errno
+import time
 from typing import TYPE_CHECKING
 
 import zmq
@@ -14,6 +15,7 @@ import zmq
 from sioms.client.keys import Folder, Pair
 from sioms.protocol import link
 
+from .connections import PROOF_S, Connection, Connections, Strangers
 from .inflow import MOST, Inflow
 from .stops import DOMAIN, Stops
 
@@ -59,6 +61,7 @@ class ZeroMq:
     def __init__(self, loop: Loop, path: str, host: str, port: int, folder: Folder) -> None:
         self._loop, self._gateway = loop, loop.gateway
         self._known: dict[bytes, tuple[str, str, int]] = {}
+        self._connections, self._strangers = Connections((port, port + 1)), Strangers(loop.log)
         self._inflow = Inflow()
         pair = folder.own() or folder.new("gateway")
         self.about = {"address": f"zmq://{host}:{port}", "public": pair.public}
@@ -120,9 +123,18 @@ class ZeroMq:
         return True
 
     def look(self) -> None:
-        """End connections of which too much waits."""
-        for fd in self._inflow.look():
+        """End connections of which too much waits, and those of strangers that are too many."""
+        try:
+            connections = self._connections.look()
+        except OSError:  # no descriptor is left: nobody new comes in either
+            return
+        for fd in self._inflow.look(connections):
             self._loop.log("warning", "connection ended", why=f"more than {MOST} bytes of it wait", descriptor=fd)
+        self._strangers.turn_away(connections, self._is_known)
+
+    def _is_known(self, fd: int, connection: Connection) -> bool:
+        """Tell who has proved himself: a handshake that lasts has succeeded, as ZeroMQ ends the others."""
+        return self._inflow.has_heard(fd) or time.monotonic() - connection.since_s > PROOF_S
 
     def close(self) -> None:
         """Let go of everything."""

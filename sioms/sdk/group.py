@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 import os
-import resource
 import select
 import socket
 import time
@@ -20,7 +19,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from sioms.descriptors import is_readable, receive
+from sioms.descriptors import MOST_FILES, is_readable, permit_files, receive
 from sioms.native.language import library
 from sioms.native.system import MOST_EVENTS
 from sioms.protocol.driver_verbs import TO_FORK_SERVER, Spawn
@@ -33,8 +32,6 @@ from .quiet_step import Many, begin_halt, begin_stop, heed_one, run_many, wait_t
 from .rt import ChangeWatch, name_process, settle
 from .runtime import Runtime
 
-MOST_FILES = 65536
-"""Descriptors that the process may have: a device takes some thirty."""
 REQUEST = 2
 """Which of a device's descriptors is the stop-request file, see ``process.run``."""
 PAUSE_S = 50e-6
@@ -311,6 +308,5 @@ def main(name: str, sock: socket.socket) -> None:
         sock: to the fork server, on which devices come.
     """
     name_process(f"sioms:{name}")
-    _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (min(most, MOST_FILES), most))
+    permit_files()
     Group(sock).run()

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
+import resource
+import socket
 import subprocess
 import time
 from collections.abc import Callable, Iterator
@@ -19,7 +22,9 @@ from remote_rig import halts_within_the_lease
 import sioms
 import sioms.aio
 from sioms.check.remote import Gateway, Relay, free_ports
+from sioms.client.command import command
 from sioms.client.keys import Folder
+from sioms.gateway.connections import MOST_STRANGERS
 from sioms.gateway.inflow import MOST
 from sioms.protocol.link import DEFAULT_LEASE_S
 
@@ -189,6 +194,26 @@ def test_a_message_without_an_end_ends_its_connection_alone(remote: sioms.Workce
     assert monitor.poll(10_000), "the gateway ends the connection"
     assert remote.status()["workcell"] == "test"
     context.destroy(0)
+
+
+def test_a_crowd_of_strangers_keeps_nobody_out(remote: sioms.Workcell, gate: Gateway) -> None:
+    files = Path(f"/proc/{gate.process.pid}/fd")
+
+    def count() -> int:
+        return len(list(files.iterdir()))
+
+    before = resource.prlimit(gate.process.pid, resource.RLIMIT_NOFILE)
+    with remote.open("mod0.xaxis", "rw", lease=10.0) as axis, contextlib.ExitStack() as crowd:
+        resource.prlimit(gate.process.pid, resource.RLIMIT_NOFILE, (count() + MOST_STRANGERS + 50, before[1]))
+        try:
+            for _ in range(MOST_STRANGERS + 200):
+                crowd.enter_context(socket.create_connection(("127.0.0.1", gate.port), 5.0))
+            wait_for(lambda: count() < MOST_STRANGERS + 40, "those above the bound to be turned away")
+            axis.write(command(0, velocity=0.0))
+            with sioms.Workcell(gate.socket, "new") as another:
+                assert another.status()["devices"]
+        finally:
+            resource.prlimit(gate.process.pid, resource.RLIMIT_NOFILE, before)
 
 
 def test_wrong_addresses_and_keys_are_told_in_a_sentence(

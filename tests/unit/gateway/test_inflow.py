@@ -9,6 +9,7 @@ from collections.abc import Iterator
 import pytest
 
 from sioms.gateway import inflow
+from sioms.gateway.connections import Connections
 from sioms.gateway.inflow import Inflow
 
 Pair = tuple[socket.socket, socket.socket]
@@ -38,60 +39,54 @@ def _arrives(pair: Pair, size: int) -> int:
     return pair[1].fileno()
 
 
+class Flow(Inflow):
+    """Looks at all connections of this process."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._connections = Connections()
+
+    def see(self) -> list[int]:
+        return self.look(self._connections.look())
+
+
 def test_what_is_taken_does_not_count_and_what_piles_up_does(pairs: list[Pair]) -> None:
-    flow = Inflow()
-    assert flow.look() == []
+    flow = Flow()
+    assert flow.see() == []
     for _ in range(20):
         flow.took(_arrives(pairs[0], 50_000), 50_000)
-        assert flow.look() == []
+        assert flow.see() == []
     _arrives(pairs[1], 90_000)
-    assert flow.look() == []
+    assert flow.see() == []
     bad = _arrives(pairs[1], 20_000)
-    assert flow.look() == [bad]
+    assert flow.see() == [bad]
     assert pairs[1][0].recv(1) == b"", "it has been shut down"
     assert _arrives(pairs[0], 5)
 
 
 def test_small_frames_earn_nothing(pairs: list[Pair]) -> None:
-    flow = Inflow()
-    flow.look()
+    flow = Flow()
+    flow.see()
     for _ in range(2_000):
         flow.took(_arrives(pairs[0], 1), 1)
-    flow.look()
-    assert flow.look() == []
-    assert flow.look() == [] and _arrives(pairs[0], 110_000) in flow.look()
+    flow.see()
+    assert flow.see() == []
+    assert flow.see() == [] and _arrives(pairs[0], 110_000) in flow.see()
 
 
 def test_many_that_are_below_the_bound_are_bounded_together(pairs: list[Pair]) -> None:
-    flow = Inflow()
-    flow.look()
+    flow = Flow()
+    flow.see()
     sizes = (60_000, 70_000, 50_000)
     fds = [_arrives(pair, size) for pair, size in zip(pairs, sizes, strict=True)]
-    assert flow.look() == [fds[1]], "the largest goes"
+    assert flow.see() == [fds[1]], "the largest goes"
 
 
 def test_a_descriptor_that_is_another_connection_begins_anew(pairs: list[Pair]) -> None:
-    flow = Inflow()
-    flow.look()
+    flow = Flow()
+    flow.see()
     fd = _arrives(pairs[0], 90_000)
-    assert flow.look() == []
+    assert flow.see() == []
     os.dup2(pairs[1][1].fileno(), fd)
     _arrives(pairs[1], 90_000)
-    assert flow.look() == []
-    assert inflow.received(fd) == 90_000
-    with open(os.devnull) as file:
-        assert inflow.received(file.fileno()) == -1
-
-
-def test_a_connection_that_is_closed_while_it_is_looked_at_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    closed = os.dup(0)
-    received = inflow.received
-
-    def closes(fd: int) -> int:
-        if fd != closed:
-            return received(fd)
-        os.close(fd)  # as a thread of ZeroMQ does when a peer leaves
-        return 5
-
-    monkeypatch.setattr(inflow, "received", closes)
-    assert Inflow().look() == []
+    assert flow.see() == []
