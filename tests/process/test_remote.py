@@ -156,7 +156,7 @@ def test_a_link_that_delays_serves_and_one_that_doubles_ends_with_a_sentence(dae
                 axis.move(axis.read().position[0])
             assert axis.read().stamp_error_ns > 10_000_000, "what is not known of the clocks is said"
             relay.doubled = True
-            with pytest.raises(OSError, match="lost|does not answer") as refused:  # half a frame twice has no end
+            with pytest.raises(OSError, match=r"lost|does not answer") as refused:  # half a frame twice has no end
                 for _ in range(100):
                     axis.move(0.0, replace=True)
             assert refused.value.errno in (errno.EIO, errno.ETIMEDOUT)
