@@ -290,7 +290,7 @@ async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
         name: what this client calls itself.
     """
     path = path or cell_address()
-    channel = connect_channel(path)
+    channel = connect_channel(path, waits=False)
     cell = AsyncWorkcell(channel, _Requests(channel, verbs.Cancel), path)
     await cell._greet(name)
     return cell

@@ -180,7 +180,7 @@ class WorkcellVerbs(Session[M]):
         if kind is not None and not (isinstance(kind, type) and issubclass(kind, self._NODE)):
             raise TypeError(f"open {name}: kind {shown(kind)}; want AxisNode, AnalogNode or BinaryNode")
         answer = await self._waiter.call(open_call(name, mode, timeout, lease))
-        core = node_parts(answer.value, answer.fds, self._channel.clock)
+        core = node_parts(answer.value, answer.fds, self._channel.clock, self._channel.carrier)
         if self._channel.clock is not None:
             lease = 0.0 if core[0].read_only else lease or REMOTE_LEASE_S
         node = self._NODES[core[0].node_class](core, self, self._waiter_of(core[-1]), lease)

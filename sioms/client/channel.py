@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from sioms.protocol.clock import Clock
     from sioms.protocol.verbs import Message
 
+    from .carrying import Carrier
     from .overdue import Overdue
 
 _CMSG_CLOEXEC = 0x40000000
@@ -155,8 +156,13 @@ def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
     return sock
 
 
-def connect_channel(address: str, timeout_s: float = CONNECT_S) -> Channel:
+def connect_channel(address: str, timeout_s: float = CONNECT_S, *, waits: bool = True) -> Channel:
     """Connect to the daemon at the path of its socket, or to a gateway, as ``zmq://HOST:PORT``.
+
+    Args:
+        address: of either.
+        timeout_s: how long that may take [s].
+        waits: whether threads of the program wait for answers, and not an event loop.
 
     Raises:
         OSError: with a sentence: nobody there, or one does not get in.
@@ -167,8 +173,11 @@ def connect_channel(address: str, timeout_s: float = CONNECT_S) -> Channel:
         __import__("site").main()
     from .remote import connect as connect_remote
 
-    sock, clock = connect_remote(address, timeout_s)
-    return Channel(sock, f"the gateway {address}", acknowledged=clock_acknowledged(clock), clock=clock)
+    sock, clock, carrier = connect_remote(address, timeout_s)
+    return Channel(
+        sock, f"the gateway {address}", acknowledged=clock_acknowledged(clock), clock=clock,
+        carrier=carrier if waits else None,
+    )  # fmt: skip
 
 
 def _is_socket(path: str) -> bool:
@@ -199,6 +208,7 @@ class Channel:
         behind: the process that made the socket and the one that answers on it, as the former numbers them;
             empty: it is the one that made it.
         clock: of the cell, where that is another machine's; None: it is ours.
+        carrier: what packets to another machine are sent by, and waited through; None: the socket.
 
     Attributes:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
@@ -214,11 +224,14 @@ class Channel:
         acknowledged: Callable[[int], None] = acknowledged_by_daemon,
         behind: Sequence[int] = (),
         clock: Clock | None = None,
+        carrier: Carrier | None = None,
     ) -> None:
         self.name = name
         self.acknowledged = acknowledged
         self.clock = clock
+        self.carrier = carrier
         self._sock = sock
+        self._flags = 0 if carrier is None else _DONTWAIT
         self._passed = passed
         self._behind = behind
         self._number = 0
@@ -232,6 +245,7 @@ class Channel:
         self.fellows: Sequence[Channel] = ()
         self._others_due_s = 0.0
         self._ended: tuple[int, str] | None = None
+        self._pid = os.getpid()
 
     @property
     def closed(self) -> bool:
@@ -289,11 +303,11 @@ class Channel:
         return message[3]
 
     def _lead(self) -> int:
-        """Begin to read for all threads; return the number of a request, 0 when somebody else reads, or leases are to
-        be kept, or nothing has been asked yet.
+        """Begin to read for all threads; return the number of a request, 0 when somebody else reads or nothing has yet
+        been asked.
         """
         with self._mutex:
-            if self._reading or self._ended is not None or self.fellows or not self._timeout:
+            if self._reading or self._ended is not None or not self._timeout:
                 return 0
             self._reading = True
             self._number += 1
@@ -303,8 +317,11 @@ class Channel:
         """Send a request and read one packet; return it if it is the usual answer, else keep it for ``wait``."""
         packet = b""
         try:
-            self._sock.send(encode(arguments[0], number, *arguments[1:]))
-            packet = self._sock.recv(MAX_PACKET)
+            self._put(encode(arguments[0], number, *arguments[1:]))
+            if self.carrier is not None:
+                self._keep_others()
+                self.carrier.wait(self._timeout)
+            packet = self._sock.recv(MAX_PACKET, self._flags)
             message = short_reply(packet, number)
             if message is None:
                 self._sort(*self._decoded(packet, []))
@@ -345,13 +362,19 @@ class Channel:
                 raise OSError(errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}")
             try:
                 for part in call.ahead:
-                    self._sock.send(Part(number, part).packed())
-                self._sock.send(packet)
+                    self._put(Part(number, part).packed())
+                self._put(packet)
             except OSError as error:
                 raise self._gone(error, call.what) from None
         if self.fellows:
             self._keep_others()
         return number
+
+    def _put(self, packet: bytes) -> None:
+        if self.carrier is None:
+            self._sock.send(packet)
+        else:
+            self.carrier.send(packet)
 
     def _keep_others(self) -> None:
         """Renew the leases of the other channels, now and then: a request tells that this client is alive, and its
@@ -371,7 +394,7 @@ class Channel:
     def notice(self, packet: bytes) -> None:
         """Send a packet that draws no answer."""
         try:
-            self._sock.send(packet)
+            self._put(packet)
         except OSError as error:
             raise self._gone(error, "send") from None
 
@@ -454,13 +477,14 @@ class Channel:
             return None
 
     def close(self) -> None:
-        """Close the socket; waiting threads get EBADF."""
+        """Close the socket; waiting threads get EBADF. In a forked child that of its parent stays open."""
         with self._mutex:
             if self._ended is None:
                 self._ended = (errno.EBADF, f"{self.name} is closed")
             if self._sock.fileno() >= 0:
-                try:  # noqa: SIM105  # contextlib costs a shell tool a millisecond
-                    self._sock.shutdown(SHUT_RDWR)
+                try:
+                    if os.getpid() == self._pid:
+                        self._sock.shutdown(SHUT_RDWR)
                 except OSError:
                     pass  # the other side was gone already
                 if not self._reading:
@@ -475,8 +499,10 @@ class Channel:
                 if timeout <= 0:
                     return None
             self._set_timeout(timeout)
+            if self.carrier is not None:
+                self.carrier.wait(timeout)
             try:
-                message, fds = self._packet(0)
+                message, fds = self._packet(self._flags)
             except BlockingIOError:
                 if self.keepalive_s:
                     self.keepalive()

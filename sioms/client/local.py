@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
     from sioms.protocol.clock import Clock
 
+    from .carrying import Carrier
+
 RENEWED_NS = 50_000_000
 """How often reading renews leases, unless one is shorter than four times that [ns]."""
 _WAKES = 4096
@@ -88,13 +90,16 @@ class LeasedPage(LocalPage):
         return super().latest(now_ns)
 
 
-def node_parts(value: Any, fds: list[int], clock: Clock | None = None) -> tuple[Any, ...]:
+def node_parts(
+    value: Any, fds: list[int], clock: Clock | None = None, carrier: Carrier | None = None
+) -> tuple[Any, ...]:
     """Turn the answer to an open into the arguments of a node.
 
     Args:
         value: the answer.
         fds: that came with it.
         clock: of the cell, where that is another machine's.
+        carrier: of the session, as of ``Channel``.
 
     Raises:
         OSError: EMFILE, this process has no descriptors left.
@@ -105,7 +110,9 @@ def node_parts(value: Any, fds: list[int], clock: Clock | None = None) -> tuple[
         for fd in fds:
             os.close(fd)
         raise OSError(errno.EMFILE, f"open {info.name}: too many open files in this process; close some")
-    channel = Channel(socket(fileno=fds[2]), f"node {info.name}", False, behind=behind, clock=clock)
+    sock = socket(fileno=fds[2])
+    carried = None if carrier is None else carrier.of(handle, sock)
+    channel = Channel(sock, f"node {info.name}", False, behind=behind, clock=clock, carrier=carried)
     if clock is None:
         return info, handle, LocalPage(fds[0], fds[1]), list(channels), bit, channel
 

@@ -1,12 +1,13 @@
 """A session of a link to a gateway on another machine: its frames on one side, on the other the same sockets, pages and
 pipes as of a daemon on this machine.
 
-A thread moves frames between both and writes what it is told into pages; sessions, nodes and channels do not know that
-it is there. It says nothing of its own that would renew a lease: what does is what the program's own calls put
-into the sockets. A session is one connection: when that is lost the session ends, with a last word that says why.
-What carries the frames is a ``Link``: ``zeromq`` or ``zenoh_link``.
+A thread moves frames between both and writes what it is told into pages; sessions, nodes and event loops do not know
+that it is there. A thread of the program that waits for an answer does its work meanwhile (``carrying``). Neither says
+anything of its own that would renew a lease: what does is what the program's own calls send. A session is one
+connection: when that is lost the session ends, with a last word that says why. What carries the frames is a ``Link``:
+``zeromq`` or ``zenoh_link``.
 
-Concurrency: one thread a session, which owns everything but the sockets' other ends. A forked child has no such thread.
+Concurrency: one thread a session, and one of the program's at a time, under a lock. A forked child has no such thread.
 """
 
 from __future__ import annotations
@@ -14,10 +15,11 @@ from __future__ import annotations
 import errno
 import os
 import select
+import signal
 import socket
 import threading
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from mmap import mmap
 from typing import Any, Protocol
@@ -31,6 +33,7 @@ from sioms.protocol.messages import MAX_PACKET, ClientVerb, MalformedMessage, re
 from sioms.protocol.page import REASON_SIZE, PageCopy, page_size
 from sioms.protocol.text import printable
 
+from .carrying import ALL, Carrier, Carrying
 from .places import place_of
 
 STALE_S = 0.2
@@ -80,19 +83,18 @@ class Link(Protocol):
     def frames(self) -> Iterator[bytes]:
         """Take what has come."""
 
-    def lost(self, ready: Collection[int], due: bool) -> str:
+    def lost(self, due: bool) -> str:
         """Return why the link has ended, '' if it has not.
 
         Args:
-            ready: descriptors that are readable.
-            due: whether to look, whatever those say.
+            due: whether to look, whether or not descriptors tell of something.
         """
 
     def close(self) -> None:
         """Let go of everything."""
 
 
-def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock]:
+def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock, Carrier]:
     """Open a session of the link.
 
     Args:
@@ -100,7 +102,7 @@ def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock]:
         timeout_s: how long that may take [s].
 
     Returns:
-        A socket as one that is connected to a daemon, and the cell's clock.
+        A socket as one that is connected to a daemon, the cell's clock, and what threads that wait can send by.
 
     Raises:
         OSError: with a sentence: no such host, nobody there, a key that is not known, another release.
@@ -120,14 +122,17 @@ def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock]:
             text = f"{what}: {error.name} is not installed; run: pip install 'sioms[net]'"
             raise OSError(errno.ENOPKG, text) from None
         carrier = ZenohLink(what, address, host, port, timeout_s)
-    bridge = _Bridge(address, carrier)
+    ours, theirs = socket.socketpair(
+        socket.AF_UNIX, socket.SOCK_SEQPACKET
+    )  # theirs is the program's alone: it closes it
+    bridge = _Bridge(address, carrier, ours)
     try:
         bridge.begin(what, deadline)
     except BaseException:
         bridge.release()
         raise
     threading.Thread(target=bridge.run, name=f"sioms {address}", daemon=True).start()
-    return bridge.theirs, bridge.clock
+    return theirs, bridge.clock, Carrier(bridge.carrying, 0, theirs)
 
 
 class _Far:
@@ -150,6 +155,7 @@ class _Far:
         self.theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
         self.answer = b""
         self.unconfirmed = 0
+        self.ended = False
 
     def hand_over(self, session: socket.socket) -> None:
         """Pass the program's ends along with the answer to its open."""
@@ -216,10 +222,10 @@ class _FarJournal:
 class _Bridge:
     """What the thread does."""
 
-    def __init__(self, address: str, carrier: Link) -> None:
+    def __init__(self, address: str, carrier: Link, ours: socket.socket) -> None:
         self._address, self._link = address, carrier
         self.clock = LinkClock()
-        self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.ours = ours
         self.ours.setblocking(False)
         self._number = 0
         self._told_ns = 0
@@ -229,8 +235,15 @@ class _Bridge:
         self._by_fd: dict[int, int] = {}
         self._stop: tuple[float, bytes] | None = None
         self._last_word: tuple[int, str] | None = None
-        self._epoll = select.epoll()
-        for fd in (*carrier.fds, self.ours.fileno()):
+        self._due_ns = 0
+        self.carrying = Carrying(self)
+        self._is_over = False
+        self._links, self._epoll = select.epoll(), select.epoll()
+        for fd in carrier.fds:
+            self._links.register(fd, select.EPOLLIN)
+        self.link_fd = self._links.fileno()
+        self._spoilt = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+        for fd in (self.link_fd, self._spoilt, self.ours.fileno()):
             self._epoll.register(fd, select.EPOLLIN)
 
     # --- beginning -------------------------------------------------------------------------------
@@ -261,9 +274,10 @@ class _Bridge:
         if left_s <= 0:
             raise OSError(errno.ETIMEDOUT, f"{what}: the gateway does not answer; is it hung?")
         came = self._take_all()  # first: sending may have taken the edge off a descriptor of what has come
-        ready = [] if came else [fd for fd, _ in self._epoll.poll(min(left_s, at_most_s))]
+        if not came:
+            self._epoll.poll(min(left_s, at_most_s))
         came = self._take_all() or came
-        if self._last_word is None and (why := self._link.lost(ready, True)):
+        if self._last_word is None and (why := self._link.lost(True)):
             came = self._take_all() or came  # the gateway may have said why
             self._last_word = self._last_word or (errno.EIO, why)
         if self._last_word is not None:
@@ -277,33 +291,84 @@ class _Bridge:
 
     def run(self) -> None:
         """Move frames until either side ends the session."""
-        try:
-            self._run()
-        except (OSError, MalformedFrame) as error:
-            self._last_word = self._last_word or (errno.EIO, f"link to {self._address} lost: {error}")
+        signal.pthread_sigmask(signal.SIG_BLOCK, ALL)  # they are for threads of the program
+        goes_on = True
+        while goes_on and self._last_word is None:
+            ready = [fd for fd, _ in self._epoll.poll(link.PING_S / 2)]
+            with self.carrying.lock:
+                try:
+                    goes_on = self._turn(ready)
+                except (OSError, MalformedFrame) as error:
+                    self._lose(str(error))
         self._finish()
 
-    def _run(self) -> None:
-        session = self.ours.fileno()
-        due_ns = 0
-        while self._last_word is None:
-            ready = [fd for fd, _ in self._epoll.poll(link.PING_S / 2)]
-            for fd in ready:
-                if fd == session:
-                    if not self._from_program():
-                        return
-                elif fd in self._by_fd:
-                    self._from_node(fd)
-            now_ns = time.monotonic_ns()
-            due = now_ns >= due_ns or self._stop is not None
-            if why := self._link.lost(ready, due):
-                self._take_all()  # the gateway may have said why
-                self._last_word = self._last_word or (errno.EIO, f"link to {self._address} lost: {why}")
-            if due:
-                self._look(now_ns)
-                due_ns = now_ns + int(link.PING_S * 1e9 / 4)
-            # Last: sending takes the edge off a descriptor of what has come.
+    def _turn(self, ready: list[int]) -> bool:
+        """Do what descriptors that are ready, and the time, ask for; return whether the session goes on."""
+        for fd in ready:
+            if fd == self.ours.fileno():
+                if not self._from_program():
+                    return False
+            elif fd in self._by_fd:
+                self._from_node(fd)
+        now_ns = time.monotonic_ns()
+        due = now_ns >= self._due_ns or self._stop is not None
+        if due or self.link_fd in ready:
+            self._look_for_loss(due)
+        if due:
+            self._look(now_ns)
+            self._due_ns = now_ns + int(link.PING_S * 1e9 / 4)
+        # Last: sending takes the edge off a descriptor of what has come.
+        self._take_all()
+        return True
+
+    def _look_for_loss(self, due: bool) -> None:
+        if why := self._link.lost(due):
+            self._take_all()  # the gateway may have said why
+            self._lose(why)
+
+    def _lose(self, why: str) -> None:
+        self._last_word = self._last_word or (errno.EIO, f"link to {self._address} lost: {why}")
+
+    # --- threads of the program ------------------------------------------------------------------
+
+    def watch(self, whether: bool) -> None:
+        """Have the session's own thread watch the link, or not."""
+        self._epoll.modify(self.link_fd, select.EPOLLIN if whether else 0)
+
+    def spoil(self, why: str) -> None:
+        """Have the session end."""
+        if not self._is_over:
+            self._lose(why)
+            os.eventfd_write(self._spoilt, 1)
+
+    def say(self, channel: int, packet: bytes) -> None:
+        """Send a packet of the program, 0 = to the daemon; raises OSError: EPIPE, that channel has ended."""
+        far = self._nodes.get(channel)
+        if self._is_over or self._last_word or (channel and (far is None or far.ended)):
+            raise BrokenPipeError(errno.EPIPE, "it has ended")
+        try:
+            if channel:
+                self._send(Up.PACKET, channel, packet)
+            else:
+                self._to_daemon(packet)
             self._take_all()
+        except (OSError, MalformedFrame) as error:
+            self.spoil(str(error))
+            raise BrokenPipeError(errno.EPIPE, str(error)) from None
+
+    def serve(self) -> None:
+        """Move what has come."""
+        if self._is_over or self._last_word:
+            return
+        try:
+            self._look_for_loss(False)
+            self._take_all()
+        except (OSError, MalformedFrame) as error:
+            self.spoil(str(error))
+        if self._last_word:
+            os.eventfd_write(self._spoilt, 1)
+
+    # --- the session's thread --------------------------------------------------------------------
 
     def _look(self, now_ns: int) -> None:
         """Do what is due by time."""
@@ -342,12 +407,15 @@ class _Bridge:
             return False
         if not packet:
             return False
+        self._to_daemon(packet)
+        return True
+
+    def _to_daemon(self, packet: bytes) -> None:
         if len(packet) > 1 and packet[1] == ClientVerb.EMERGENCY_STOP:
             self._stop = (time.monotonic() + STOP_AGAIN_S, packet)
             self._link.stop(link.pack(Up.PACKET, body=packet))
-            return True
-        self._send(Up.PACKET, 0, packet)
-        return True
+        else:
+            self._send(Up.PACKET, 0, packet)
 
     def _from_node(self, fd: int) -> None:
         handle = self._by_fd[fd]
@@ -422,7 +490,7 @@ class _Bridge:
 
     def _end_of(self, far: _Far, handle: int) -> None:
         """Let the program find a node's connection ended; its page goes on telling how the device is."""
-        fd = far.ours.fileno()
+        fd, far.ended = far.ours.fileno(), True
         if self._by_fd.pop(fd, None) is not None:
             self._epoll.unregister(fd)
             far.ours.shutdown(socket.SHUT_RDWR)
@@ -451,6 +519,13 @@ class _Bridge:
 
     def _finish(self) -> None:
         """Tell both sides, and let go of everything."""
+        with self.carrying.lock:
+            self._is_over = True
+            self._tell_end()
+        self.carrying.end(self.release)
+
+    def _tell_end(self) -> None:
+        """Tell both sides: a thread of the program that moves frames finds it in the socket that it waits for."""
         if self._last_word is None:
             with suppress(OSError):
                 self._send(Up.BYE)
@@ -464,7 +539,9 @@ class _Bridge:
                 far.wake_up()
             with suppress(OSError):
                 self.ours.send(word)
-        self.release()
+        for sock in (self.ours, *(far.ours for far in self._nodes.values())):
+            with suppress(OSError):
+                sock.shutdown(socket.SHUT_RDWR)
 
     def release(self) -> None:
         """Let go of everything."""
@@ -474,4 +551,6 @@ class _Bridge:
         self._drop_journals()
         self.ours.close()
         self._link.close()
+        self._links.close()
         self._epoll.close()
+        os.close(self._spoilt)

@@ -6,6 +6,7 @@ Concurrency: the thread of the session; frames come on threads of Zenoh, and are
 from __future__ import annotations
 
 import atexit
+import ctypes
 import errno
 import os
 import secrets
@@ -13,8 +14,10 @@ import socket
 import ssl
 import threading
 from collections import deque
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
+from typing import Any
+from weakref import WeakSet
 
 import zenoh
 from zenoh.handlers import Callback
@@ -46,6 +49,9 @@ class ZenohLink:
     """
 
     def __init__(self, what: str, address: str, host: str, port: int, timeout_s: float) -> None:
+        if _users - {os.getpid()}:
+            text = "this process was forked from one that had used Zenoh, whose threads are not in it"
+            raise OSError(errno.ENOTSUP, f"{what}: {text}; start it by multiprocessing's spawn")
         folder = Folder()
         mine = own(folder, what)
         probe(what, host, port, timeout_s)
@@ -54,6 +60,7 @@ class ZenohLink:
         self._came = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         self.fds: tuple[int, ...] = (self._came,)
         connect = {"endpoints": [endpoint(host, port)], "timeout_ms": int(1e3 * timeout_s), "exit_on_failure": True}
+        _users.add(os.getpid())
         try:
             self._session = zenoh.open(config(folder, "connect", BLOCKED_US, mode="client", connect=connect))
         except zenoh.ZError as error:
@@ -61,6 +68,8 @@ class ZenohLink:
             raise _reason(what, host, port, folder, error) from None
         name = f"{mine.number}/{secrets.token_hex(8)}"
         self._closing, self._waking = threading.Lock(), threading.Lock()
+        self._declared: list[Any] = []
+        _open.add(self)
         atexit.register(self._end)  # or threads of Zenoh would call an interpreter that has ended
         try:
             self._declare(name)
@@ -72,13 +81,14 @@ class ZenohLink:
     def _declare(self, name: str) -> None:
         """Say what is sent and taken under a name."""
         session, live = self._session, self._session.liveliness()
-        self._declared = [
+        self._declared += (
             session.declare_subscriber(f"{DOWN}/{name}", Callback(self._take, indirect=False)),
             live.declare_subscriber(GATEWAY, Callback(self._gateway, indirect=False), history=True),
             live.declare_token(f"{ALIVE}/{name}"),
-        ]
+        )
         self._up = self._publisher(f"{UP}/{name}", zenoh.Priority.INTERACTIVE_HIGH)
         self._stop = self._publisher(f"{STOP}/{name}", zenoh.Priority.REAL_TIME)
+        self._declared += self._up, self._stop
 
     def _publisher(self, key: str, priority: zenoh.Priority) -> zenoh.Publisher:
         block = zenoh.CongestionControl.BLOCK
@@ -127,7 +137,7 @@ class ZenohLink:
             self._bytes -= len(frame)
             yield frame
 
-    def lost(self, ready: Collection[int], due: bool) -> str:
+    def lost(self, due: bool) -> str:
         """Return why the connection has ended, '' if it has not."""
         return self._lost
 
@@ -140,11 +150,31 @@ class ZenohLink:
                 os.close(self._came)
                 self._came = -1
 
+    def leave(self) -> None:
+        """Leave the session to the parent of this process, in which its threads are: here nothing of it ever ends."""
+        atexit.unregister(self._end)
+        for each in (self._session, *self._declared):
+            ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
+
     def _end(self) -> None:
         """End Zenoh's session; who comes second waits for the first."""
         with self._closing:
             if not self._session.is_closed():
                 self._session.close()  # type: ignore[no-untyped-call]
+
+
+_open: WeakSet[ZenohLink] = WeakSet()
+_users: set[int] = set()
+"""Processes that have opened a session of Zenoh: this one, and those that it was forked from."""
+
+
+def _leave_all() -> None:
+    """Leave the links of the parent to it, in a forked child: what ends one would wait for threads of the parent."""
+    for each in list(_open):
+        each.leave()
+
+
+os.register_at_fork(after_in_child=_leave_all)
 
 
 def _reason(what: str, host: str, port: int, folder: Folder, error: zenoh.ZError) -> OSError:

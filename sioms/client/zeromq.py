@@ -6,9 +6,11 @@ Concurrency: the thread of the session.
 from __future__ import annotations
 
 import errno
+import os
 import time
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
+from select import POLLIN, poll
 from typing import Any
 
 import zmq
@@ -20,14 +22,15 @@ from sioms.protocol.link import Up
 from .keys import Folder
 from .places import probe
 
-_context: zmq.Context[zmq.Socket[bytes]] | None = None
+_contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
+"""By process: the threads of a parent's are not in a forked child, which leaves it alone."""
 
 
 def _socket(public: str, secret: str, server: str) -> zmq.Socket[bytes]:
-    global _context
-    if _context is None or _context.closed:
-        _context = zmq.Context(1)
-    sock = _context.socket(zmq.DEALER)
+    pid = os.getpid()
+    if pid not in _contexts or _contexts[pid].closed:
+        _contexts[pid] = zmq.Context(1)
+    sock = _contexts[pid].socket(zmq.DEALER)
     sock.curve_publickey, sock.curve_secretkey = public.encode(), secret.encode()
     sock.curve_serverkey = server.encode()
     for option, value in (
@@ -75,6 +78,8 @@ class ZmqLink:
         self._monitor_fd = int(self._monitor.getsockopt(zmq.FD))
         fds = [int(sock.getsockopt(zmq.FD)) for sock in (self._requests, self._stops)]
         self.fds: tuple[int, ...] = (*fds, self._monitor_fd)
+        self._told_of_end = poll()
+        self._told_of_end.register(self._monitor_fd, POLLIN)
         try:
             self._shake_hands(what, timeout_s)
         except BaseException:
@@ -122,9 +127,9 @@ class ZmqLink:
             while int(sock.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
                 yield sock.recv(zmq.DONTWAIT)
 
-    def lost(self, ready: Collection[int], due: bool) -> str:
+    def lost(self, due: bool) -> str:
         """Return why the connection has ended, '' if it has not."""
-        if not due and self._monitor_fd not in ready:
+        if not due and not self._told_of_end.poll(0):
             return ""
         while int(self._monitor.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
             happened: Any = parse_monitor_message(self._monitor.recv_multipart())

@@ -110,12 +110,14 @@ class ZeroMq:
                 known[peer] = (str(first.get("User-Id")), str(first.get("Peer-Address")), int(first.get(zmq.SRCFD)))
                 frame = first.bytes
             public, host, fd = known[peer]
-            size, more = len(frame), router.getsockopt(zmq.RCVMORE)
-            while router.getsockopt(zmq.RCVMORE):
+            size = len(frame)
+            more = several = bool(router.getsockopt(zmq.RCVMORE))
+            while more:
                 size += len(router.recv())
+                more = bool(router.getsockopt(zmq.RCVMORE))
             self._inflow.took(fd, size)
             # A peer that names itself could take over the name of one that has gone: those of ZeroMQ begin with zero.
-            if more or not self.owns(peer):
+            if several or not self.owns(peer):
                 continue
             gateway.frame(peer, self._loop.principal(public), host, frame)
             if peer not in gateway.sessions:

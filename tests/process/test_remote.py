@@ -260,3 +260,20 @@ def test_sessions_come_and_go_and_leave_nothing(daemon: Daemon, gate: Gateway) -
         come_and_go()
     wait_for(lambda: descriptors(gate.process.pid) <= before[0] + 2, "the gateway has let go", 5.0)
     wait_for(lambda: descriptors(os.getpid()) <= before[1] + 6, "we have let go", 5.0)
+
+
+def test_a_forked_child_has_a_session_of_its_own_or_none(remote: sioms.Workcell, gate: Gateway) -> None:
+    remote.info("mod0")
+    for opens in (True, False):
+        child = os.fork()
+        if not child:
+            code = 30
+            try:
+                with sioms.Workcell(gate.socket, "child") if opens else remote as cell:
+                    code = 10 + (cell.info("mod0").name == "mod0")
+            except OSError as error:
+                code = 20 + ("forked child" in str(error))
+            finally:
+                os._exit(code)
+        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == (11 if opens else 21)
+        assert remote.info("mod0").name == "mod0"

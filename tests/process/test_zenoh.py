@@ -72,6 +72,27 @@ def test_whatever_fails_halts_what_was_held_within_the_lease(
     halts_within_the_lease(what, ZenohGateway, daemon, cell, client)
 
 
+_FORKS = """
+import os, sys, sioms
+cell = sioms.Workcell(sys.argv[1], "parent")
+child = os.fork()
+if not child:
+    try:
+        sioms.Workcell(sys.argv[1], "child")
+    except OSError as error:
+        sys.exit(str(error))
+os.waitpid(child, 0)
+print(cell.info("mod0").name)
+"""
+
+
+def test_a_forked_child_ends_and_is_told_that_it_has_no_zenoh(daemon: Daemon, gate: ZenohGateway) -> None:
+    run = subprocess.run(
+        [sys.executable, "-P", "-c", _FORKS, gate.socket], capture_output=True, text=True, timeout=30.0, check=True
+    )
+    assert "forked from one that had used Zenoh" in run.stderr and run.stdout == "mod0\n"
+
+
 def _session(gate: ZenohGateway, folder: Folder) -> zenoh.Session:
     connect = {"endpoints": [endpoint("127.0.0.1", gate.port)], "timeout_ms": 2000, "exit_on_failure": True}
     return zenoh.open(config(folder, "connect", mode="client", connect=connect))

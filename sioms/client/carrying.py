@@ -1,0 +1,154 @@
+"""Frames of a link that are moved by the thread of the program that waits for one: changes of threads take a good part
+of the time of a request.
+
+One thread of the program at a time takes the place of the session's own, for as long as it waits for an answer. What it
+does with the link it does whole: signals, whose handlers may raise, are held back for the moment. Should one come by
+another thread of the program all the same, the session ends.
+
+Concurrency: any threads of the process that has made the session; none of a forked child.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import threading
+from _signal import (  # type: ignore[import-not-found]  # that of ``signal`` makes an enumeration of each number
+    SIG_BLOCK,
+    SIG_SETMASK,
+    pthread_sigmask,
+    valid_signals,
+)
+from collections.abc import Callable
+from select import POLLIN, poll
+from time import monotonic
+from typing import TYPE_CHECKING, Protocol
+
+if TYPE_CHECKING:
+    from _socket import socket
+
+ALL = valid_signals()
+WHY_MS = 1000
+"""How long the session's own thread may take to say why a channel has ended [ms]."""
+MAIN = threading.main_thread().ident
+
+
+class Bridge(Protocol):
+    """What moves the frames of a session, as far as threads of the program do it.
+
+    Attributes:
+        link_fd: readable when the link has something to do.
+    """
+
+    link_fd: int
+
+    def say(self, channel: int, packet: bytes) -> None:
+        """Send a packet of the program, 0 = to the daemon; raises OSError: EPIPE, that channel has ended."""
+
+    def serve(self) -> None:
+        """Move what has come."""
+
+    def watch(self, whether: bool) -> None:
+        """Have the session's own thread watch the link, or not."""
+
+    def spoil(self, why: str) -> None:
+        """Have the session end."""
+
+
+class Carrying:
+    """The right to move the frames of a session, which its own thread and those of the program share.
+
+    Args:
+        bridge: what moves them.
+
+    Attributes:
+        lock: held by who does something with the link.
+    """
+
+    def __init__(self, bridge: Bridge) -> None:
+        self.lock = threading.Lock()
+        self.bridge = bridge
+        self.leading = threading.Lock()
+        self._pid = os.getpid()
+
+    def alone(self, act: Callable[[], None]) -> None:
+        """Do something with the link, whole, in a thread of the program.
+
+        Raises:
+            OSError: EPROTO, in a forked child; and what it raises.
+        """
+        if os.getpid() != self._pid:
+            raise OSError(errno.EPROTO, "a forked child cannot use the session of its parent; open another one")
+        before = pthread_sigmask(SIG_BLOCK, ALL) if threading.get_ident() == MAIN else None
+        try:
+            with self.lock:
+                try:
+                    act()
+                except OSError:
+                    raise
+                except BaseException as error:  # of a signal's handler: another thread has got that
+                    self.bridge.spoil(f"{type(error).__name__} while a frame was moved")
+                    raise
+        finally:
+            if before is not None:
+                pthread_sigmask(SIG_SETMASK, before)
+
+    def end(self, release: Callable[[], None]) -> None:
+        """Let go of the link when no thread of the program moves its frames; none will any more."""
+        self.leading.acquire()
+        with self.lock:
+            release()
+
+
+class Carrier:
+    """A channel of a session: see ``channel.Channel``.
+
+    Args:
+        carrying: of the session.
+        channel: number of the handle, 0 = the daemon.
+        sock: the program's end of its socket, in which answers arrive.
+    """
+
+    __slots__ = ("_both", "_carrying", "_channel", "_fd", "_own")
+
+    def __init__(self, carrying: Carrying, channel: int, sock: socket) -> None:
+        self._carrying, self._channel, self._fd = carrying, channel, sock.fileno()
+        self._own, self._both = poll(), poll()
+        for each in (self._own, self._both):
+            each.register(self._fd, POLLIN)
+        self._both.register(carrying.bridge.link_fd, POLLIN)
+
+    def of(self, channel: int, sock: socket) -> Carrier:
+        """Return that of another channel of the session."""
+        return Carrier(self._carrying, channel, sock)
+
+    def send(self, packet: bytes) -> None:
+        """Send a packet.
+
+        Raises:
+            OSError: EPIPE, the channel has ended, and says why when it is read; EPROTO, in a forked child.
+        """
+        try:
+            self._carrying.alone(lambda: self._carrying.bridge.say(self._channel, packet))
+        except BrokenPipeError:
+            self._own.poll(WHY_MS)
+            raise
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until an answer has arrived, and move frames meanwhile unless another thread of the program does."""
+        carrying = self._carrying
+        bridge, deadline = carrying.bridge, monotonic() + timeout_s
+        if not carrying.leading.acquire(False):
+            self._own.poll(1e3 * timeout_s)
+            return
+        try:
+            bridge.watch(False)
+            while (left_s := deadline - monotonic()) > 0:
+                ready = self._both.poll(1e3 * left_s)
+                if any(fd == self._fd for fd, _ in ready):
+                    return
+                if ready:
+                    carrying.alone(bridge.serve)
+        finally:
+            bridge.watch(True)
+            carrying.leading.release()

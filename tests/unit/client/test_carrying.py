@@ -1,0 +1,211 @@
+"""Threads of the program move a link's frames while they wait, and leave it whole whatever happens to them."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import os
+import signal
+import socket
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from sioms.client.carrying import Carrier
+from sioms.client.channel import Call, Channel
+from sioms.client.remote import _Bridge
+from sioms.protocol import link, verbs
+from sioms.protocol.link import Down, Up
+from sioms.protocol.messages import decode, reply
+
+
+class Link:
+    """A link that answers requests by their number, but for those that it is told to keep."""
+
+    def __init__(self) -> None:
+        self.came = os.eventfd(0, os.EFD_NONBLOCK)
+        self.fds: tuple[int, ...] = (self.came,)
+        self.sent: list[tuple[int, int]] = []
+        self.by: list[int] = []
+        self.taken_by: list[int] = []
+        self.why = ""
+        self.keeps = False
+        self.during: Callable[[], None] = lambda: None
+        self._frames: deque[bytes] = deque()
+
+    def send(self, frame: bytes) -> None:
+        kind, _, number, _, body = link.unpack(frame, link.MAX_TO_GATEWAY)
+        self.sent.append((kind, number))
+        if kind == Up.PACKET:
+            self.by.append(threading.get_ident())
+            self.during()
+            if not self.keeps:
+                self.bring(decode(body)[1])
+
+    def bring(self, number: int) -> None:
+        self._frames.append(link.pack(Down.PACKET, body=reply(number, f"answer {number}")))
+        os.eventfd_write(self.came, 1)
+
+    def lose(self, why: str) -> None:
+        self.why = why
+        os.eventfd_write(self.came, 1)
+
+    def stop(self, frame: bytes) -> None:
+        self.send(frame)
+
+    def frames(self) -> Iterator[bytes]:
+        with contextlib.suppress(BlockingIOError):
+            os.eventfd_read(self.came)
+        while self._frames:
+            self.taken_by.append(threading.get_ident())
+            yield self._frames.popleft()
+
+    def lost(self, due: bool) -> str:
+        return self.why
+
+    def close(self) -> None:
+        os.close(self.came)
+
+
+class Rig:
+    """A session of a link, its thread, and the program's channel."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.link = Link()
+        self.bridge = _Bridge("zmq://lab2:5770", self.link, ours)
+        self.thread = threading.Thread(target=self.bridge.run, daemon=True)
+        self.bridge._heard_ns = self.bridge._pinged_ns = time.monotonic_ns()
+        self.thread.start()
+        carrier = Carrier(self.bridge.carrying, 0, theirs)
+        self.channel = Channel(theirs, "the gateway", carrier=carrier)
+
+    def ask(self, limit_s: float = 0.0) -> Any:
+        return self.channel.call(Call("list", verbs.List(), limit_s=limit_s)).value
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    made.channel.close()
+    made.thread.join(5.0)
+    assert not made.thread.is_alive(), "the session's thread ends with the session"
+
+
+class Interrupted(Exception):
+    """What a handler of a signal raises."""
+
+
+@pytest.fixture
+def interrupts() -> Iterator[None]:
+    def handler(*_: object) -> None:
+        raise Interrupted
+
+    before = signal.signal(signal.SIGALRM, handler)
+    yield
+    signal.setitimer(signal.ITIMER_REAL, 0.0)
+    signal.signal(signal.SIGALRM, before)
+
+
+def test_who_waits_sends_and_takes_without_another_thread(rig: Rig) -> None:
+    assert [rig.ask() for _ in range(20)] == [f"answer {number}" for number in range(1, 21)]
+    assert {*rig.link.by, *rig.link.taken_by} == {threading.get_ident()}
+    assert [number for kind, number in rig.link.sent if kind == Up.PACKET] == list(range(1, 21)), "none is missing"
+
+
+def test_what_comes_while_nobody_waits_is_taken_by_the_sessions_thread(rig: Rig) -> None:
+    rig.ask()
+    rig.link.bring(99)
+    deadline = time.monotonic() + 5.0
+    while rig.link.taken_by[-1] != rig.thread.ident and time.monotonic() < deadline:
+        time.sleep(0.001)
+    assert rig.link.taken_by[-1] == rig.thread.ident
+
+
+def test_of_many_threads_one_moves_frames_and_all_are_answered(rig: Rig) -> None:
+    answers: list[str] = []
+    threads = [
+        threading.Thread(target=lambda: answers.extend(rig.ask(5.0) for _ in range(50)), daemon=True) for _ in range(4)
+    ]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(20.0)
+    assert sorted(answers) == sorted(f"answer {number}" for number in range(1, 201))
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_a_signal_ends_the_wait_and_not_the_session(rig: Rig) -> None:
+    rig.link.keeps = True
+    signal.setitimer(signal.ITIMER_REAL, 0.05)
+    with pytest.raises(Interrupted):
+        rig.ask(5.0)
+    rig.link.keeps = False
+    assert rig.ask() == "answer 2"
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_a_signal_while_a_frame_is_moved_comes_after_that(rig: Rig) -> None:
+    moved: list[str] = []
+
+    def during() -> None:
+        signal.raise_signal(signal.SIGALRM)
+        moved.append("whole")
+
+    rig.link.during = during
+    with pytest.raises(Interrupted):
+        rig.ask()
+    assert moved == ["whole"], "the frame has been sent before the handler ran"
+    rig.link.during = lambda: None
+    assert rig.ask() == "answer 2"
+    assert [number for kind, number in rig.link.sent if kind == Up.PACKET] == [1, 2]
+
+
+def test_what_raises_while_a_frame_is_moved_all_the_same_ends_the_session(rig: Rig) -> None:
+    def during() -> None:
+        raise Interrupted
+
+    rig.ask()
+    rig.link.during = during
+    with pytest.raises(Interrupted):
+        rig.ask()
+    with pytest.raises(OSError, match="link to zmq://lab2:5770 lost: Interrupted while a frame was moved") as told:
+        rig.ask()
+    assert told.value.errno == errno.EIO
+
+
+@pytest.mark.parametrize("waits", [True, False])
+def test_a_lost_link_is_told_to_who_waits_and_to_who_asks_next(rig: Rig, waits: bool) -> None:
+    rig.link.keeps = waits
+    threading.Timer(0.05, rig.link.lose, ["it is cut"]).start()
+    if not waits:
+        rig.thread.join(5.0)
+    with pytest.raises(OSError, match="link to zmq://lab2:5770 lost: it is cut"):
+        rig.ask(5.0)
+
+
+def test_a_program_that_drops_its_session_ends_it(rig: Rig) -> None:
+    made = Rig()
+    made.ask()
+    thread, sent = made.thread, made.link.sent
+    del made
+    thread.join(5.0)
+    assert not thread.is_alive() and sent[-1][0] == Up.BYE
+
+
+def test_a_forked_child_is_refused_and_harms_nothing(rig: Rig) -> None:
+    rig.ask()
+    child = os.fork()
+    if not child:
+        try:
+            rig.ask()
+        except OSError as error:
+            os._exit(0 if "forked child" in str(error) else 1)
+        os._exit(2)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert rig.ask() == "answer 2"
