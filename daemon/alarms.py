@@ -234,7 +234,7 @@ class AlarmFile:
             OSError: they cannot be written; what was kept before is there still.
         """
         with suppress(FileNotFoundError):
-            os.close(self._open(os.O_RDONLY))  # what is no file is not replaced
+            os.close(self._open(os.O_RDONLY))  # what is not a file is not replaced
         if entries:
             self._replace(json.dumps(entries, separators=(",", ":")).encode() + b"\n")
         else:

@@ -288,7 +288,7 @@ def read_config(path: str) -> str:
     """Return the text of a configuration.
 
     Raises:
-        OSError: it cannot be read; EINVAL, it is no file, or one of more than LARGEST bytes.
+        OSError: it cannot be read; EINVAL, it is not a file, or one of more than LARGEST bytes.
         UnicodeDecodeError: it is no UTF-8.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)  # a pipe would hold up the daemon

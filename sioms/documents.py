@@ -69,7 +69,7 @@ def json_of(text: str | bytes) -> Any:
 
 
 def json_text(value: object) -> str:
-    """Return a value as JSON for people and programs; what is no number becomes null."""
+    """Return a value as JSON for people and programs; what is not a number becomes null."""
 
     def plain(value: Any) -> Any:
         if isinstance(value, dict):

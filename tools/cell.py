@@ -145,7 +145,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def print_json(value: object) -> None:
-    """Print a value as JSON; what is no number becomes null."""
+    """Print a value as JSON; what is not a number becomes null."""
     from sioms.documents import json_text
 
     print(json_text(value))

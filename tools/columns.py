@@ -47,7 +47,7 @@ class Columns:
         info: what the node is.
 
     Raises:
-        UsageError: a structure that the node has not, or a mode for something that is no axis.
+        UsageError: a structure that the node has not, or a mode for something that is not an axis.
     """
 
     __slots__ = ("_channels", "_info", "_mode", "_names", "count", "has_end", "is_axis", "replace")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .options import number
 
 MAX_TOKEN = 400
-"""Longest number [characters]; what goes on longer is no number, and must not fill the memory."""
+"""Longest number [characters]; what goes on longer is not a number, and must not fill the memory."""
 MAX_LINE = 1 << 20
 """Longest line [characters] when bad lines are left out, for which a line must be read to its end."""
 

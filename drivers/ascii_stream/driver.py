@@ -282,7 +282,7 @@ class Inspection:
         """Return where the first good line ends, None while there is none.
 
         Raises:
-            LinkError: this is no text: a wrong baud rate, most likely.
+            LinkError: this is not text: a wrong baud rate, most likely.
             DeviceError: another device: its lines are never what is configured.
         """
         end = reply.find(b"\n") + 1  # the first line is cut

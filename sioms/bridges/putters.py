@@ -99,7 +99,7 @@ class Putters:
         uid = user_of(client, (self._address(client[0]), self.here[1]))
         if uid in self._uids:
             return
-        who = f"{peer} is no connection that a user of this machine has open" if uid is None else _named(uid)
+        who = f"{peer} is not a connection of a user of this machine" if uid is None else _named(uid)
         more = "; --anybody-stops takes stops from all" if stops else ""
         raise OSError(
             errno.EACCES, f"{who}; want one of {', '.join(map(_named, sorted(self._uids)))} on this machine{more}"

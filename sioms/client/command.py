@@ -47,7 +47,7 @@ def command(
         The packed record; records are joined with ``+`` or given to ``write`` as a list.
 
     Raises:
-        TypeError: a word that is no number.
+        TypeError: a word that is not a number.
         ValueError: an unknown word, nothing commanded, or words of a group missing.
 
     Example:

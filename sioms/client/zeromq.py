@@ -102,7 +102,7 @@ class ZmqLink:
                 )
             raise OSError(
                 errno.EACCES,
-                f"{what}: whoever listens there has another key than the one that is trusted here, or is no gateway; "
+                f"{what}: whoever listens there has another key than the one trusted here, or is not a gateway; "
                 "compare `sioms key list` of both machines",
             )
         with suppress(zmq.ZMQError):

@@ -58,7 +58,7 @@ def _key(folder: Folder, name: str, what: str, hint: str) -> ec.EllipticCurvePri
     except (ValueError, TypeError) as error:
         raise OSError(errno.EINVAL, f"{what}: {folder.file(name)} is damaged: {error}") from None
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise OSError(errno.EINVAL, f"{what}: {folder.file(name)} is no key of an elliptic curve")
+        raise OSError(errno.EINVAL, f"{what}: {folder.file(name)} is not an elliptic-curve key")
     return key
 
 

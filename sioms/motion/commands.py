@@ -210,7 +210,7 @@ class Validator:
                 errno.EINVAL,
                 commands,
                 i,
-                f"control_mode {int(mode[i]):#06x} is no command; one of {names}, RELATIVE only with POSITION",
+                f"control_mode {int(mode[i]):#06x} is not a command; want one of {names}, RELATIVE only with POSITION",
             )
         passes = int(M.POSITION | M.VELOCITY)
         bad = (mode & passes) == passes

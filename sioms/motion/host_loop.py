@@ -397,7 +397,7 @@ class AxisBank(Bank):
         self._motion_watch.begin()
 
     def _refuse_measurement(self, now_ns: int) -> None:
-        """Go on with what was read before where a reading is no number."""
+        """Go on with what was read before where a reading is not a number."""
         bad = np.flatnonzero(~np.isfinite(self._measured))
         self.fault(bad, "the measured position is not a finite number", now_ns)
         self._measured[bad] = self._last_raw[bad]

@@ -119,7 +119,7 @@ class CommandQueue:
             replace: the buffers of these axes will be emptied first.
         """
         if records.dtype != WIRE_DTYPE:
-            raise CommandError(errno.EINVAL, "write: the records are no axis write records; table F.3")
+            raise CommandError(errno.EINVAL, "write: the records are not axis write records; table F.3")
         placed = self._validator.place(records, np.asarray(axes, dtype=np.int64))
         counts = np.bincount(placed, minlength=self.n)
         touched = np.flatnonzero(counts)

@@ -146,7 +146,7 @@ class Recording:
         damage: a sentence for each place that could not be read, of what was read so far.
 
     Raises:
-        OSError: it cannot be read; EINVAL: it is no recording.
+        OSError: it cannot be read; EINVAL: it is not a recording.
     """
 
     def __init__(self, path: str | Path) -> None:
@@ -160,7 +160,7 @@ class Recording:
                 kind = "a folder" if stat.S_ISDIR(what.st_mode) else "no ordinary file"
                 raise OSError(errno.EINVAL, f"read {path}: it is {kind}; want a recording")
             if self._read(0, len(mcap.MAGIC)) != mcap.MAGIC:
-                raise OSError(errno.EINVAL, f"read {path}: it is no recording: it does not begin as MCAP files do")
+                raise OSError(errno.EINVAL, f"read {path}: it is not a recording: it does not begin as MCAP files do")
         except OSError:
             os.close(self._fd)
             raise

@@ -215,7 +215,7 @@ class Line:
         """Return the length of the reply, with what is in front of it, and its value; None while more must come.
 
         Raises:
-            LinkError: this is no reply, nor the beginning of one.
+            LinkError: this is not a reply, nor the beginning of one.
             DeviceError: the device refuses.
         """
         data = bytes(reply)

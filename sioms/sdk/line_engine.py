@@ -150,7 +150,7 @@ class LineEngine(Connected):
         state.is_asked, state.silent_ticks = False, 0
         if state.fresh:
             state.fresh = False
-            # only now: a port that accepts and closes is no device, nor is one that is opened and never read
+            # only now: a port that accepts and closes is not a device, nor is one that is opened and never read
             self._pause_ns = state.pause_ns = FIRST_PAUSE_NS
             self._pages.set_link(state.unit.blocks, PageState.GOOD, "")
             for block in state.unit.blocks:

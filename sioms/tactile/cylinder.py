@@ -129,7 +129,7 @@ def respond(cylinder: Cylinder, k: ArrayLike, r: ArrayLike) -> Response:
 
 def _check(cylinder: Cylinder, wave: Floats, radius: Floats) -> None:
     if not np.all((wave >= 0.0) & (wave == np.floor(wave)) & np.isfinite(wave)):
-        raise ValueError(f"compute response: wave numbers {wave} hold one that is no integer >= 0")
+        raise ValueError(f"compute response: wave numbers {wave} contain one that is not an integer >= 0")
     slack = 1e-12 * cylinder.outer_m
     inside = (radius >= cylinder.core_m - slack) & (radius <= cylinder.outer_m + slack)
     if not inside.all():

@@ -136,7 +136,7 @@ def _recording(file: Any) -> Recording:
     falls = np.flatnonzero(~(np.diff(time_s) >= 0.0))
     if falls.size:
         raise ValueError(
-            f"time falls or is no number after frame {falls[0]}; want the frames in the order of their times"
+            f"time falls or is not a number after frame {falls[0]}; want the frames in the order of their times"
         )
 
     def column(name: str, fallback: float) -> Any:

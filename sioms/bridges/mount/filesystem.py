@@ -115,7 +115,7 @@ class Nodes(mfusepy.Operations):  # type: ignore[misc]
         """Return an open file, which the calling process uses from now on."""
         file = self._files[handle]
         if not isinstance(file, NodeFile):
-            raise OSError(errno.EINVAL, "this file is no node")
+            raise OSError(errno.EINVAL, "this file is not a node")
         tid = mfusepy.fuse_get_context()[2]
         if not file.knows(tid):
             file.use(tid, self._caller().process)
@@ -306,7 +306,7 @@ def _arguments(text: bytes) -> tuple[Any, float | None]:
     try:
         value = json_of(text[:MOST_TEXT].decode())
     except ValueError as error:
-        raise OSError(errno.EINVAL, f"its argument is no JSON: {error}") from None
+        raise OSError(errno.EINVAL, f"its argument is not JSON: {error}") from None
     if not isinstance(value, list) or len(value) > 2:
         raise OSError(errno.EINVAL, "its argument; want JSON: [argument] or [argument, timeout in seconds]")
     argument = value[0] if value else None

@@ -115,7 +115,7 @@ def _values(numbers: list[float], info: NodeInfo) -> bytes:
 
 def _command(words: list[str], info: NodeInfo) -> bytes:
     if info.node_class is not NodeClass.AXIS:
-        raise ValueError(f"{words[0][:40]!r} is no number; want {_wanted(info)}")
+        raise ValueError(f"{words[0][:40]!r} is not a number; want {_wanted(info)}")
     axis = 0
     if "=" not in words[0] and words[0] not in _PLAIN:
         axis = _axis(words.pop(0), info)

@@ -185,7 +185,7 @@ def _live(args: argparse.Namespace, subject: Subject, say: Say) -> tuple[Any, fl
 
     if args.model is None:
         raise BadInputError(
-            f"reconcile {args.data}: it is no file or folder, and for a node --model is needed: the nominal model"
+            f"reconcile {args.data}: there is no such file or folder; a node needs --model, the nominal model"
         )
     try:
         return subject.live(args, args.out / "records", say)

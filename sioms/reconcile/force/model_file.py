@@ -51,7 +51,7 @@ def from_table(table: Mapping[str, Any], where: str) -> tuple[SensorModel, tuple
             matrix = np.asarray(t["matrix"], dtype=np.float64)
         except (TypeError, ValueError) as e:
             raise BadInputError(
-                f"read model {where}: matrix holds what is no number, or rows of different lengths"
+                f"read model {where}: matrix holds what is not a number, or rows of different lengths"
             ) from e
         if matrix.shape != (count, count) or not np.isfinite(matrix).all():
             raise BadInputError(

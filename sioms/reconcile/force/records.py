@@ -50,7 +50,7 @@ def unit_of(name: str) -> str:
 
 
 def whole_rows(r: ForceRecords) -> tuple[ForceRecords, list[str]]:
-    """Leave out rows with a value that is no number, and number the rows where no time was recorded.
+    """Leave out rows with a value that is not a number, and number the rows where no time was recorded.
 
     Returns:
         The records, as they are where too many rows would go, and notes.

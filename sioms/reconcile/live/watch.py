@@ -282,7 +282,7 @@ class Beside:
 
         Raises:
             OSError: the cell or a node is not there.
-            BadInputError: a node is no axis that can be watched.
+            BadInputError: a node is not an axis that can be watched.
         """
         cell = self._cell = self.connect()
         self.offset_s = CellTime(cell.clock).offset_ns * 1e-9

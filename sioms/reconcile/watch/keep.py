@@ -84,7 +84,7 @@ def _plain(value: Any, offset_s: float) -> dict[str, Any]:
 
 def _number(value: Any, most: float = 1e15) -> float:
     if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) <= most:
-        raise ValueError(f"{str(value)[:40]!r} is no number in range")
+        raise ValueError(f"{str(value)[:40]!r} is not a number in range")
     return float(value)
 
 

@@ -146,7 +146,7 @@ def score(args: argparse.Namespace) -> int:
     if bad := [str(folder) for folder in folders if not _is_data(folder)]:
         raise ValueError(f"score fingers: {', '.join(bad)} holds no *.npz; give folders of recordings")
     if args.truth is not None and not args.truth.is_dir():
-        raise ValueError(f"score fingers: {args.truth} is no folder; want the one with NAME.json")
+        raise ValueError(f"score fingers: {args.truth} is not a folder; want the one with NAME.json")
     progress = Progress(len(folders))
     work = [(folder, args.truth, math.radians(args.edge_deg)) for folder in folders]
     workers = min(args.jobs or len(os.sched_getaffinity(0)), len(work))

@@ -35,7 +35,7 @@ def test_the_owner_of_a_connection_is_known_until_he_closes_it(host: str) -> Non
         putters.judge(f"[{peer[0]}]:{peer[1]}" if ":" in host else f"{peer[0]}:{peer[1]}", stops=False)
         client.close()
         assert user_of(peer, here) is None, "of a closed end the kernel says 0, which is root"
-        with pytest.raises(PermissionError, match="is no connection that a user of this machine has open"):
+        with pytest.raises(PermissionError, match="is not a connection of a user of this machine"):
             putters.judge(f"{peer[0]}:{peer[1]}", stops=True)
 
 

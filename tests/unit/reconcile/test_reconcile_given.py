@@ -44,7 +44,7 @@ def test_a_file_that_is_no_toml_says_so(text: bytes, says: str) -> None:
         ({"sensor": 3}, "sensor is 3; needs a table"),
         ({"sensor": SENSOR | {"components": "fz"}}, "components is 'fz'; needs a list"),
         ({"sensor": SENSOR | {"colour": 1}}, "nobody reads colour"),
-        ({"sensor": SENSOR | {"matrix": [["a"]]}}, "matrix holds what is no number"),
+        ({"sensor": SENSOR | {"matrix": [["a"]]}}, "matrix holds what is not a number"),
         ({"sensor": SENSOR, "effects": 3}, "effects is 3; needs a table"),
         ({"sensor": SENSOR, "effects": {"gain": 3}}, "gain is 3; needs a table"),
         ({"sensor": SENSOR, "effects": {"gain": {"on": "no"}}}, "true or false"),

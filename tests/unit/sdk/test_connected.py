@@ -53,7 +53,7 @@ def port() -> Iterator[socket.socket]:
 
 @pytest.mark.parametrize("accepts", [True, False])
 def test_a_port_that_accepts_and_closes_is_tried_less_and_less_often(port: socket.socket, accepts: bool) -> None:
-    """Nobody has said anything: that is no device, and each try costs lines in the log."""
+    """Nobody has said anything: that is not a device, and each try costs lines in the log."""
     line = LineSettings(tcp=f"127.0.0.1:{port.getsockname()[1]}")
     if not accepts:
         port.close()

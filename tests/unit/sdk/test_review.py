@@ -35,7 +35,7 @@ def babbler() -> Iterator[tuple[Line, socket.socket]]:
 
 
 def _want(data: bytes) -> int | None:
-    raise LinkError(f"{data[:1]!r} is no reply")
+    raise LinkError(f"{data[:1]!r} is not a reply")
 
 
 def _poll() -> Steps:

@@ -149,7 +149,7 @@ def test_score_names_what_it_cannot_read(tmp_path: Path, capsys: pytest.CaptureF
     assert "give folders of recordings" in capsys.readouterr().err
     np.savez(tmp_path / "x.npz", raw=np.zeros((3, 16)), time=np.zeros(3), fs=33.0)
     assert command("score", str(tmp_path), "--truth", str(tmp_path / "none")) == 1
-    assert "is no folder" in capsys.readouterr().err
+    assert "is not a folder" in capsys.readouterr().err
 
 
 def test_tables_of_edges_agree_with_the_finger(folder: Path) -> None:
@@ -212,7 +212,7 @@ def test_calibrate_names_what_is_wrong(folder: Path, tmp_path: Path, capsys: pyt
         ({"raw": lambda a: a[:, :15]}, "touches have 15 elements; the finger has 16"),
         ({"raw": lambda a: np.where(np.arange(len(a))[:, None] < len(a) // 4, np.nan, a)}, "touch 0: element 0 holds a "
                                                                                            "reading"),
-        ({"time": lambda a: a[::-1]}, "time falls or is no number after frame 0"),
+        ({"time": lambda a: a[::-1]}, "time falls or is not a number after frame 0"),
         ({"touch": lambda a: a + 0.5}, "touch holds a value that is not an integer"),
     ],
 )  # fmt: skip
