@@ -151,7 +151,7 @@ def test_a_cut_and_a_merge_hold_what_they_shall(tmp_path: Path) -> None:
 def test_what_is_no_recording_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(b"position,velocity\n1,2\n")
-    with pytest.raises(OSError, match="no recording"):
+    with pytest.raises(OSError, match="not a recording"):
         Recording(path)
 
 
