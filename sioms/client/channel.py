@@ -318,8 +318,9 @@ class Channel:
         packet = b""
         try:
             self._put(encode(arguments[0], number, *arguments[1:]))
-            if self.carrier is not None:
+            if self.fellows:
                 self._keep_others()
+            if self.carrier is not None:
                 self.carrier.wait(self._timeout)
             packet = self._sock.recv(MAX_PACKET, self._flags)
             message = short_reply(packet, number)

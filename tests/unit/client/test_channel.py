@@ -214,19 +214,33 @@ def test_take_does_not_wait(peer: Peer) -> None:
     assert packet is not None and peer.channel.result(packet).value == 5
 
 
-def test_a_request_renews_what_is_kept_alive_with_its_channel_however_soon_it_is_answered() -> None:
+@pytest.mark.parametrize("short", [False, True])
+def test_a_request_renews_what_is_kept_alive_with_its_channel_however_soon_it_is_answered(*, short: bool) -> None:
     peers = [Peer() for _ in range(3)]
     channels = [peer.channel for peer in peers]
     for channel in channels:
         channel.fellows, channel.keepalive_s = channels[1:], 0.01
     peers[2].sock.close()  # who has gone disturbs nobody
+    if short:
+        acquainted(peers[0])
+        channels[0]._others_due_s = 0.0
+        while peers[1].sock.recv(100) != KEEPALIVE:
+            pass
+
+    def ask() -> None:
+        if not short:
+            channels[0].send(Call("ask", Ioctl(1, None, None)))
+            return
+        peers[0].sock.send(reply(channels[0]._number + 1, 1, 1))
+        channels[0].short_call((1, 1, 0.5, b"data"), lambda: pytest.fail("another way"))
+
     for _ in range(2):
-        channels[0].send(Call("ask", Ioctl(1, None, None)))
+        ask()
         assert peers[1].sock.recv(100) == KEEPALIVE
         time.sleep(0.02)
     channels[0].keepalive_s = 3600.0
     for _ in range(3):  # and no more often than the shortest lease asks for
-        channels[0].send(Call("ask", Ioctl(1, None, None)))
+        ask()
     peers[1].sock.settimeout(0.05)
     assert peers[1].sock.recv(100) == KEEPALIVE
     with pytest.raises(TimeoutError):
