@@ -14,12 +14,15 @@ from typing import Any
 
 from sioms.turns import Turns
 
+from .precedence import Precedence
+
 SHARE = 0.7
 """Of its time, what the daemon spends at most on requests."""
 TIDY = 1024
 """Pending calls from which on cancelled ones are looked for."""
 RESTLESS_NS, REST_NS, PAUSE_S = 20_000_000, 100_000, 0.005
 """After so long without a wait of at least REST_NS the loop pauses."""
+NEVER_NS = 2**63
 Callback = Callable[[], Any]
 
 
@@ -41,12 +44,14 @@ class Loop:
 
     Attributes:
         turns: serves clients, one packet after all else that there is to do.
+        precedence: where the loop stands among real-time processes; None: it may not be one of them.
 
     Concurrency: one thread.
     """
 
     def __init__(self) -> None:
         self._epoll = select.epoll()
+        self.precedence: Precedence | None = None
         self._callbacks: dict[int, Callback] = {}
         self.turns = Turns(self._epoll, (SHARE,))
         self._timers: list[tuple[int, int, Timer]] = []
@@ -80,6 +85,10 @@ class Loop:
         """Call back once after a delay [s]."""
         return self.at(time.monotonic_ns() + int(delay_s * 1e9), callback)
 
+    def be_prompt(self, ahead: int) -> None:
+        """Work ahead of all drivers, which this thread does under SCHED_FIFO, with this priority."""
+        self.precedence = Precedence(self._epoll.fileno(), ahead)
+
     def run(self) -> None:
         """Run until ``running`` is cleared."""
         while self.running:
@@ -94,11 +103,7 @@ class Loop:
         if self._timers:
             due_s = max(0.0, (self._timers[0][0] - time.monotonic_ns()) / 1e9)
             timeout = due_s if pause_s is None else min(pause_s, due_s)
-        began_ns = time.monotonic_ns()
-        events = self._epoll.poll(timeout)
-        rested_ns = time.monotonic_ns()
-        if rested_ns - began_ns > REST_NS:
-            self._restless_ns = rested_ns
+        events = self._wait(timeout)
         for fd, _ in events:
             # An earlier callback of this round may have closed this descriptor.
             callback = self._callbacks.get(fd)
@@ -110,8 +115,29 @@ class Loop:
         self.turns.serve()
         self._serve_timers()
         if time.monotonic_ns() - self._restless_ns > RESTLESS_NS:
-            time.sleep(PAUSE_S)  # it may run before all other processes: a flood must not take the machine with it
-            self._restless_ns = time.monotonic_ns()
+            self._pause()
+
+    def _wait(self, timeout_s: float) -> list[tuple[int, int]]:
+        """Wait for events, at most for so long, for ever where it is negative."""
+        began_ns = time.monotonic_ns()
+        if self.precedence is not None:
+            self.precedence.wait(began_ns + int(timeout_s * 1e9) if timeout_s >= 0.0 else NEVER_NS)
+        events = self._epoll.poll(timeout_s)
+        if self.precedence is not None:
+            self.precedence.work()
+        rested_ns = time.monotonic_ns()
+        if rested_ns - began_ns > REST_NS:
+            self._restless_ns = rested_ns
+        return events
+
+    def _pause(self) -> None:
+        """Leave the processor to others: who runs before all of them must not take the machine along in a flood."""
+        if self.precedence is not None:
+            self.precedence.wait(time.monotonic_ns() + int(PAUSE_S * 1e9))
+        time.sleep(PAUSE_S)
+        if self.precedence is not None:
+            self.precedence.work()
+        self._restless_ns = time.monotonic_ns()
 
     def _serve_timers(self) -> None:
         now = time.monotonic_ns()

@@ -6,7 +6,7 @@ Concurrency: everything runs in the daemon's loop.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from sioms.protocol import driver_verbs
@@ -142,9 +142,22 @@ class Processes:
     def adopt(self, plan: Plan) -> ForkServer | None:
         """Fork from now on as a configuration wants; return the fork server of before, for the caller to close."""
         old, self._fork_server = self._fork_server, plan.fork_server
-        of_all = priorities(plan.names, plan.config)
+        of_all = self._bounded(priorities(plan.names, plan.config))
         self._options = {name: _options_of(name, plan, of_all[name]) for name in plan.config.devices}
         return old
+
+    def _bounded(self, wanted: Mapping[str, int]) -> Mapping[str, int]:
+        """Return the real-time priorities that drivers get: below that with which the daemon works."""
+        precedence = self._cell.loop.precedence
+        if precedence is None:
+            return wanted
+        for name, priority in wanted.items():
+            if priority > precedence.most:
+                self._cell.log("warning", "real-time priority", device=name, wanted=priority, given=precedence.most,
+                               why="the daemon must be able to work before its drivers")  # fmt: skip
+        given = {name: min(priority, precedence.most) for name, priority in wanted.items()}
+        precedence.adopt(given.values())
+        return given
 
     def take_up(self, plan: Plan, names: NameTable) -> None:
         """Start, replace and end devices, so that those of an adopted configuration run.

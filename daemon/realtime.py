@@ -7,6 +7,7 @@ for clients, shells and the person who wants to stop them; so the greediest of t
 from __future__ import annotations
 
 import os
+import resource
 import time
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -16,6 +17,8 @@ SHARE = 0.7
 LOOKS = 3
 """Looks in a row with more than that after which the greediest is made an ordinary process."""
 LOOK_S = 1.0
+HIGHEST = 99
+"""Highest priority of SCHED_FIFO."""
 
 
 class Budget:
@@ -70,14 +73,33 @@ def realtime_use(pids: Mapping[str, int]) -> dict[str, tuple[int, float]]:
     return found
 
 
-def end_promptly(thread: int = 0) -> None:
-    """Have a thread of ours (0: the one that asks) run before all ordinary processes, where the first one does.
+def run_at(thread: int, priority: int) -> None:
+    """Give a thread (0: the one that asks) a priority under SCHED_FIFO; what it starts does not inherit it.
 
-    A killed process is dead, and its drivers halt, when its last thread has had a processor to end on.
+    Raises:
+        OSError: it may not have it.
+    """
+    os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(priority))
+
+
+def run_ahead(thread: int = 0) -> int:
+    """Give a thread of ours the highest priority that there is, or that we may have; return it, 0 for none."""
+    for priority in (HIGHEST, resource.getrlimit(resource.RLIMIT_RTPRIO)[0]):
+        with suppress(OSError):
+            run_at(thread, priority)
+            return priority
+    return 0
+
+
+def end_promptly(thread: int = 0) -> None:
+    """Have a thread of ours (0: the one that asks) run ahead of all drivers, where the loop does.
+
+    A killed process is dead, and its drivers halt, when its last thread has had a processor to end on. And while a
+    thread has the interpreter's lock, the loop waits for it: nobody who waits for the loop may come before it.
     """
     with suppress(OSError):
         if os.sched_getscheduler(os.getpid()) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
-            os.sched_setscheduler(thread, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+            run_ahead(thread)
 
 
 def make_ordinary(pid: int) -> None:

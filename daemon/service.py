@@ -21,12 +21,9 @@ from .loading import Loader, NotDescribed, Plan, read_config
 from .log import Log
 from .loop import Loop
 from .needs import this_machine, told
-from .realtime import end_promptly
+from .realtime import end_promptly, run_ahead
 from .server import Server
 from .stop_record import StopRecord
-
-PRIORITY = 50
-"""SCHED_FIFO priority of the daemon: that of a driver, so that it gets its turn whenever a tick is done."""
 
 
 def serve(config_path: str, given_path: str | None, level: str, process: ForkServerProcess) -> int:
@@ -55,7 +52,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: ForkSer
             file=sys.stderr,
         )
         return 1
-    _become_prompt(log)
+    _become_prompt(loop, log)
     permit_files()
     try:
         server = Server(loop, listening, config_path, log, record, process)
@@ -81,19 +78,21 @@ def serve(config_path: str, given_path: str | None, level: str, process: ForkSer
     return server.exit_status
 
 
-def _become_prompt(log: Log) -> None:
-    """Run before all ordinary processes, where allowed, and beside the drivers; what we start does not inherit it.
+def _become_prompt(loop: Loop, log: Log) -> None:
+    """Run ahead of all other processes, where allowed; what we start does not inherit it.
 
-    Not for work but for the end: a killed process closes its sockets only when it gets a processor, and by
-    that the drivers see that we are gone. Also an emergency stop or a SIGTERM through us then waits for nobody.
+    For work, lest drivers keep it from us; and for the end: a killed process closes its sockets only when it gets a
+    processor, and by that the drivers see that we are gone. Also an emergency stop or a SIGTERM through us then waits
+    for nobody.
     """
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(PRIORITY))
-        for thread in os.listdir("/proc/self/task"):  # those that have begun; later ones do so by themselves
-            if int(thread) != os.getpid():
-                end_promptly(int(thread))
-    except OSError as error:
-        log("debug", "runs without SCHED_FIFO", why=error.strerror)
+    ahead = run_ahead()
+    if not ahead:
+        log("debug", "runs without SCHED_FIFO", why="it may not")
+        return
+    loop.be_prompt(ahead)
+    for thread in os.listdir("/proc/self/task"):  # those that have begun; later ones do so by themselves
+        if int(thread) != os.getpid():
+            end_promptly(int(thread))
 
 
 def check(path: str, process: ForkServerProcess) -> int:

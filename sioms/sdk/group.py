@@ -37,6 +37,9 @@ REQUEST = 2
 PAUSE_S = 50e-6
 """After each device that has come, and after each few that have been served in a row: a process in a real-time class
 must not work for long without a pause."""
+CLOSING_S = 1e-3
+"""Pause for a process that ends to close more of its sockets, which it may do on this processor, in an ordinary class.
+"""
 IN_A_ROW = 8
 FAIR = 4
 """One turn in so many goes to who can wait best, however many cannot."""
@@ -110,7 +113,7 @@ class Group:
                     self._take(self._sock)
             if self._loses:  # a process that ends closes one socket after another, if it gets to
                 self._loses = False
-                time.sleep(PAUSE_S)
+                time.sleep(CLOSING_S)
             else:
                 self._serve_next()
 

@@ -71,13 +71,14 @@ def test_timers_are_served_between_the_requests_of_a_crowd() -> None:
 
 THREADS = """
 import os, sys, threading
+from sioms.daemon.loop import Loop
 from sioms.daemon.service import _become_prompt
 from sioms.daemon.stop_record import StopRecord
 from sioms.daemon.users import Users
 
 early = StopRecord(sys.argv[1])
 told = []
-_become_prompt(lambda *words, **more: told.append(words))
+_become_prompt(Loop(), lambda *words, **more: told.append(words))
 if told:
     sys.exit(77)  # it may not
 late = StopRecord(sys.argv[1] + "2")
