@@ -79,3 +79,19 @@ def test_steps_are_compiled_again_after_a_change_of_any_of_them(dev):
     """Those of the drivers were not: after a change they ran as Python, at a multiple of the cost."""
     steps = {path for folder in ("sioms", "drivers", "daemon", "tools") for path in (TREE / folder).rglob("*_step.py")}
     assert steps and steps <= set(dev.compiled_sources())
+
+
+@pytest.mark.parametrize("there", ["test", "run", "service"])
+@pytest.mark.parametrize("wanted", ["test", "run", "service"])
+def test_a_larger_list_holds_the_smaller_ones(dev, tmp_path, there, wanted):
+    """Who has run the tests runs the demonstration without a network."""
+
+    def table(profile):
+        return {"python": "python", "extras": dev.EXTRAS[profile], "packages": dev.pins(profile)}
+
+    stamp = tmp_path / "stamp"
+    stamp.write_text(dev.json.dumps(table(there)))
+    larger = ["test", "run", "service"]
+    assert dev.stamped(stamp, table(wanted)) is (larger.index(there) <= larger.index(wanted))
+    changed = table(wanted) | {"packages": [*dev.pins(wanted), "another==1.0"]}
+    assert not dev.stamped(stamp, changed) and not dev.stamped(stamp, table(wanted) | {"python": "other"})
