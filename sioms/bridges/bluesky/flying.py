@@ -194,9 +194,8 @@ class FlyScan:
             with suppress(OSError):
                 self.axis.stop()
         self._ending.set()
-        thread, self._thread = self._thread, None
-        if thread is not None:
-            thread.join()
+        if self._thread is not None:
+            self._thread.join()  # whoever else waits for it, too: after this the recording is whole
 
 
 def _events(recording: Recording, device: Device) -> Iterator[dict[str, Any]]:
