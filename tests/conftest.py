@@ -160,6 +160,18 @@ class Running:
         self._reader.join(1.0)  # a grandchild may hold the pipe open; what came until now is enough
         return status
 
+    def wait_for(self, condition: Callable[[], object], what: str, timeout_s: float = 3 * PATIENCE_S) -> None:
+        """Wait for something that the process brings about.
+
+        Raises:
+            AssertionError: the process ended before it, or the time ran out; the message holds all that was said.
+        """
+        deadline = time.monotonic() + timeout_s
+        while not condition():
+            if self.process.poll() is not None or time.monotonic() > deadline:
+                raise AssertionError(self._told(f"{what}: not before its end, and not within {timeout_s:g} s"))
+            time.sleep(0.002)
+
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
 

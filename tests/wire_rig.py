@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,8 @@ from daemon_rig import wait_for
 import sioms
 from sioms.protocol.flags import AxisStatus
 
+LATE_S = 2.0
+"""How late readings may get on a busy machine before they count as none [s]."""
 SLIDE = """
 [device.slide0]
 driver = "modbus-axis"
@@ -150,14 +153,21 @@ class Wire:
         return self.client
 
     def reads(self, node: str) -> bool:
-        """Tell whether a node can be read."""
-        try:
-            read_only = self.client.info(node).read_only
-            with self.client.open(node if read_only else f"{node}.readonly") as opened:
-                opened.read()
-        except OSError:
-            return False
-        return True
+        """Tell whether a node can be read; one whose readings are only late is waited for."""
+        deadline = time.monotonic() + LATE_S
+        while True:
+            try:
+                with self.client.open(self.reader(node)) as opened:
+                    opened.read()
+                return True
+            except OSError as error:
+                if "gone or hung" not in str(error) or time.monotonic() > deadline:
+                    return False
+            time.sleep(0.01)
+
+    def reader(self, node: str) -> str:
+        """Return the name under which a node is read without owning it."""
+        return node if self.client.info(node).read_only else f"{node}.readonly"
 
     def wait_up(self, node: str) -> None:
         """Wait until a node can be read."""

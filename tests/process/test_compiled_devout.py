@@ -76,8 +76,10 @@ def test_a_line_does_the_same_either_way(daemon: Daemon, cell: sioms.Workcell, l
 
 
 def start(daemon: Daemon, compiled: bool, axis: str = "mod0.xaxis") -> subprocess.Popen[bytes]:
-    """Start a devout that moves an axis for some seconds."""
-    process = subprocess.Popen([TOOL, "-vt", axis, "0.01", "8"], env=environment(daemon, compiled), stderr=-1, stdin=-3)
+    """Start a devout that moves an axis for as long as a busy machine may need to start another."""
+    process = subprocess.Popen(
+        [TOOL, "-vt", axis, "0.005", "60"], env=environment(daemon, compiled), stderr=-1, stdin=-3
+    )
     with sioms.Workcell(daemon.socket) as cell, cell.open(axis + ".readonly") as node:
         wait_for(lambda: node.read().in_motion[0], "the axis in motion")
     assert (os.path.realpath(f"/proc/{process.pid}/exe") == str(PROGRAM)) == compiled

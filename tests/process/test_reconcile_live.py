@@ -178,10 +178,11 @@ def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs
     assert any(name.startswith("separate_") for name in records)
 
 
+@pytest.mark.timeout(400)
 def test_the_emergency_stop_ends_an_experiment_and_nothing_resumes(daemon: Daemon, tmp_path: Path) -> None:
     run = workflow(daemon, tmp_path, "--yes")
     with daemon.cell() as session, session.open("mod0.xaxis.readonly") as axis:
-        wait_for(lambda: abs(axis.read().velocity[0]) > 1e-3, "the experiment moves the axis", 60.0)
+        run.wait_for(lambda: abs(axis.read().velocity[0]) > 1e-3, "the experiment moves the axis")
         session.emergency_stop(why="test")
         at_rest(axis)
         assert run.wait_exit(60.0) == STOPPED
@@ -194,10 +195,11 @@ def test_the_emergency_stop_ends_an_experiment_and_nothing_resumes(daemon: Daemo
     assert not (tmp_path / "report").exists()
 
 
+@pytest.mark.timeout(400)
 def test_an_interrupted_experiment_leaves_the_axis_halted_and_free(daemon: Daemon, tmp_path: Path) -> None:
     run = workflow(daemon, tmp_path, "--yes")
     with daemon.cell() as session, session.open("mod0.xaxis.readonly") as axis:
-        wait_for(lambda: abs(axis.read().velocity[0]) > 1e-3, "the experiment moves the axis", 60.0)
+        run.wait_for(lambda: abs(axis.read().velocity[0]) > 1e-3, "the experiment moves the axis")
         os.kill(run.process.pid, signal.SIGINT)
         assert run.wait_exit(60.0) == STOPPED
         at_rest(axis)

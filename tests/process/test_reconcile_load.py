@@ -146,10 +146,11 @@ def pressed(session: object, node: str) -> float:
         return float(np.mean([s.data[TY] for s in sensor.history(seen)]))
 
 
+@pytest.mark.timeout(400)
 def test_the_emergency_stop_ends_the_loading_and_nothing_resumes(daemon: Daemon, tmp_path: Path) -> None:
     run = workflow(daemon, tmp_path, "--yes")
     with daemon.cell() as session, session.open("press.near.readonly") as axis:
-        wait_for(lambda: axis.read().position[0] > 0.0021, "the axis presses", 60.0)
+        run.wait_for(lambda: axis.read().position[0] > 0.0021, "the axis presses")
         session.emergency_stop(why="test")
         at_rest(axis)
         assert run.wait_exit(60.0) == STOPPED

@@ -117,11 +117,12 @@ def test_hidden_gains_are_named_and_the_driver_loads_the_finger(cell: Path, tmp_
     assert np.allclose(np.diag(gains), installed.elements.gain)
 
 
+@pytest.mark.timeout(400)
 def test_the_emergency_stop_ends_the_probing_and_nothing_resumes(cell: Path, tmp_path: Path) -> None:
     run = workflow(cell, tmp_path, "--yes")
     with sioms.Workcell(str(cell / "prober.sock"), "test") as session:
         with session.open("prober.radial.readonly") as axis:
-            wait_for(lambda: axis.read().position[0] > SURFACE_M, "the indenter on the finger", 60.0)
+            run.wait_for(lambda: axis.read().position[0] > SURFACE_M, "the indenter on the finger")
             session.emergency_stop(why="test")
             at_rest(axis)
             assert run.wait_exit(60.0) == STOPPED
@@ -136,13 +137,14 @@ def test_the_emergency_stop_ends_the_probing_and_nothing_resumes(cell: Path, tmp
     assert not (tmp_path / "report" / "verdict.json").exists()
 
 
+@pytest.mark.timeout(700)
 def test_an_interrupted_probing_leaves_the_indenter_clear_at_rest_and_free(cell: Path, tmp_path: Path) -> None:
     run = workflow(cell, tmp_path, "--yes")
     with sioms.Workcell(str(cell / "prober.sock"), "test") as session:
         with session.open("prober.radial.readonly") as axis:
-            wait_for(lambda: axis.read().position[0] > SURFACE_M + 2e-4, "the indenter in the finger", 60.0)
-            wait_for(lambda: axis.read().position[0] < SURFACE_M, "the first touch felt", 60.0)
-            wait_for(lambda: axis.read().position[0] > SURFACE_M + 2e-4, "the indenter in the finger", 60.0)
+            run.wait_for(lambda: axis.read().position[0] > SURFACE_M + 2e-4, "the indenter in the finger")
+            run.wait_for(lambda: axis.read().position[0] < SURFACE_M, "the first touch felt")
+            run.wait_for(lambda: axis.read().position[0] > SURFACE_M + 2e-4, "the indenter in the finger")
             os.kill(run.process.pid, signal.SIGINT)
             assert run.wait_exit(60.0) == STOPPED
             at_rest(axis)

@@ -64,7 +64,8 @@ def ask(kind, value=0):
         if reply[:1] != kind:
             raise LinkError("reply to another request")
         return reply[1]
-    return Exchange(kind + bytes([value]), lambda data: 2, decode, 0.3, False, kind.decode())
+    timeout_s = 0.3 if kind == b"P" else 5.0  # a slow answer to a write is no loss, nor is a busy machine
+    return Exchange(kind + bytes([value]), lambda data: 2, decode, timeout_s, False, kind.decode())
 
 
 class Unit(LineUnit):

@@ -288,15 +288,15 @@ def test_the_front_end_streams(array: tuple[Simulator, serial.Serial]) -> None:
     assert ask(port, stream.hello()) == stream.Hello(1, 16, stream.Format.I16, 1000, "TAC16")
     with pytest.raises(DeviceError, match="out of range"):
         ask(port, stream.start(1, 5000))
-    ask(port, stream.start(1, 500))
+    ask(port, stream.start(1, 100))  # its port holds what comes in most of a second, if the reader is held up
     receiver = FrameReceiver()
-    blocks = blocks_of(port, receiver, 100)
+    blocks = blocks_of(port, receiver, 40)
     assert set(steps_of(blocks)) == {1}
-    assert (blocks[-1].t_us - blocks[0].t_us) / 99 == pytest.approx(2000, abs=2)
+    assert (blocks[-1].t_us - blocks[0].t_us) / 39 == pytest.approx(10000, abs=2)
     assert all(abs(value) < 30 for block in blocks for value in block.values)
     device.tell("touch 3 1 2 0.7")
     device.tell("lose 3")
-    blocks = blocks[-1:] + blocks_of(port, receiver, 100)
+    blocks = blocks[-1:] + blocks_of(port, receiver, 40)
     assert sorted(steps_of(blocks))[-2:] == [1, 4]
     # 3 N at 2000 counts/N, the greatest at column 1 of row 2
     assert sum(blocks[-1].values) == pytest.approx(6000, abs=60)
