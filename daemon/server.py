@@ -73,7 +73,8 @@ class Server:
             self.cell, self.stops, self.alarms, self.requests.nodes, self.requests.markers, self._maybe_ready, self._end
         )
         self.stops.restore()
-        Door(self.cell, self.clients, listening.sock, self.requests.receive).welcome()
+        self.door = Door(self.cell, self.clients, listening.sock, self.requests.receive)
+        self.door.welcome()
         self._alive()
         self._look_at_budget()
         self._look_at_clients()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import collections
 import contextlib
 import ctypes
+import gc
 import itertools
 import json
 import os
@@ -12,6 +14,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -62,7 +65,49 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: -taken.get(item.nodeid.partition("::")[0], 0.0))
 
 
+def pytest_collection_finish() -> None:
+    """Let the garbage collector pass over what lives until the end: modules and tests."""
+    gc.collect()
+    gc.freeze()
+
+
+MOST_LEFT_OPEN = 64
+"""Descriptors that the tests of a file may leave behind; a process that holds 1024 is at the end of many a limit."""
+OF_PROCESSES = ("tests/devices/", "tests/process/")
+"""Their files are few, and what they leave open is mostly in processes that have ended."""
+_open_before: dict[str, set[str]] = {}
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> Iterator[None]:
+    """Fail the last test of a file that leaves descriptors open, which the garbage collector closes not either."""
+    yield
+    path = item.nodeid.partition("::")[0]
+    if (nextitem is not None and nextitem.nodeid.partition("::")[0] == path) or path.startswith(OF_PROCESSES):
+        return
+    before = _open_before.pop(path, set())
+    if len(_descriptors() - before) > MOST_LEFT_OPEN:
+        gc.collect()
+    left = [_leads_to(number) for number in _descriptors() - before]
+    if len(left) > MOST_LEFT_OPEN:
+        most = ", ".join(f"{count} of {name}" for name, count in collections.Counter(left).most_common(5))
+        pytest.fail(f"{path} leaves {len(left)} descriptors open, at most {MOST_LEFT_OPEN} may be: {most}")
+
+
+def _descriptors() -> set[str]:
+    return set(os.listdir("/proc/self/fd"))
+
+
+def _leads_to(number: str) -> str:
+    """Return what a descriptor leads to, without what differs from one to the next."""
+    try:
+        return re.sub(r"\d+|\[.*", "", os.readlink(f"/proc/self/fd/{number}"))
+    except OSError:
+        return "nothing"
+
+
 def pytest_runtest_setup(item: pytest.Item) -> None:
+    _open_before.setdefault(item.nodeid.partition("::")[0], _descriptors())
     if item.get_closest_marker("root") and os.geteuid() != 0:
         pytest.skip("needs the rights of root")
 

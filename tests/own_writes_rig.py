@@ -393,8 +393,8 @@ def worlds() -> Iterator[Callable[..., World]]:
             return made[0]
 
         yield make
-        for world in made:
-            world.close()
+        while made:
+            made.pop().close()
 
 
 def world_device(world: list[World], settings: LineSettings) -> Any:

@@ -162,9 +162,12 @@ class Cell:
             for fd in (*device.page_fds, device.journal_fd):
                 os.close(fd)
         files = server.cell.shared.files
-        for fd in (server.cell.shared.fds[0], server.cell.shared.fds[3], *files.client_fds, record.drivers_fd):
+        shared = server.cell.shared
+        for fd in (shared.fds[0], shared.fds[3], *files.client_fds, record.drivers_fd):
             os.close(fd)
-        server.cell.shared.request.close()
+        os.close(shared.journal.fd)
+        os.close(server.door._spare)
+        shared.request.close()
         record._journal.close()
         server.cell.loop.close()
         self.listener.close()

@@ -40,12 +40,25 @@ def quick_disk():
         yield
 
 
+FILES = []
+"""Files of the processes of a test."""
+
+
+@pytest.fixture(autouse=True)
+def ended():
+    """After a test nothing is open of processes that were killed in it."""
+    yield
+    while FILES:
+        FILES.pop().let_go()
+
+
 class Kept:
     """A bank with a file, that can be killed and started again."""
 
     def __init__(self, path, given, start=0.0, boot=BOOT):
         self.said = []
         self.file = PositionFile(str(path), [given], boot, lambda level, text: self.said.append(f"{level} {text}"))
+        FILES.append(self.file)
         self.rig = Rig([given], start=[start], keeper=self.file)
 
 
@@ -109,6 +122,7 @@ def test_a_servo_that_still_settles_is_not_at_rest(tmp_path):
         return np.array([0.01 * math.exp(-swing["t"] / 0.05) * math.cos(60 * swing["t"])])
 
     file = PositionFile(str(tmp_path / "x"), [axis(restore=ALWAYS)], BOOT, lambda *_: None)
+    FILES.append(file)
     rig = Rig([axis(restore=ALWAYS)], keeper=file, plant=plant)
     marked = []
     for _ in range(700):
@@ -239,6 +253,7 @@ def test_wherever_a_process_is_killed_no_entry_is_wrong(tmp_path_factory, histor
             complete = True
     except Killed:
         assert not complete
+    file.let_go()
     entry = decode(path.read_bytes()).entries["x"]
     if complete:
         assert bool(entry.state & AT_REST) == noted[-1][0]
