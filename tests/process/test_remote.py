@@ -243,7 +243,7 @@ def test_wrong_addresses_and_keys_are_told_in_a_sentence(
     mallory = other.own()
     assert mallory is not None
     other.trust(f"127.0.0.1:{gate.port}", mallory.public)
-    with raises(errno.EACCES, "another key than the one that is trusted"):
+    with raises(errno.EACCES, "another key than the one trusted here"):
         sioms.Workcell(gate.socket)
 
 
