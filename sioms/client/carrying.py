@@ -19,10 +19,10 @@ from _signal import (  # type: ignore[import-not-found]  # that of ``signal`` ma
     pthread_sigmask,
     valid_signals,
 )
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from select import POLLIN, poll
 from time import monotonic
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, Self
 
 if TYPE_CHECKING:
     from _socket import socket
@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 ALL = valid_signals()
 WHY_MS = 1000
 """How long the session's own thread may take to say why a channel has ended [ms]."""
+END_S = 5.0
+"""How long a thread of the program may take to notice the end of the session that it moves frames of [s]."""
 MAIN = threading.main_thread().ident
 
 
@@ -71,13 +73,18 @@ class Carrying:
         self.leading = threading.Lock()
         self._pid = os.getpid()
 
+    @property
+    def is_a_childs(self) -> bool:
+        """Whether this is a forked child, in which the session's own thread is not."""
+        return os.getpid() != self._pid
+
     def alone(self, act: Callable[[], None]) -> None:
         """Do something with the link, whole, in a thread of the program.
 
         Raises:
             OSError: EPROTO, in a forked child; and what it raises.
         """
-        if os.getpid() != self._pid:
+        if self.is_a_childs:
             raise OSError(errno.EPROTO, "a forked child cannot use the session of its parent; open another one")
         before = pthread_sigmask(SIG_BLOCK, ALL) if threading.get_ident() == MAIN else None
         try:
@@ -95,9 +102,9 @@ class Carrying:
 
     def end(self, release: Callable[[], None]) -> None:
         """Let go of the link when no thread of the program moves its frames; none will any more."""
-        self.leading.acquire()
-        with self.lock:
-            release()
+        if self.leading.acquire(timeout=END_S):  # else a signal has come where it should not: let it leak
+            with self.lock:
+                release()
 
 
 class Carrier:
@@ -152,3 +159,41 @@ class Carrier:
         finally:
             bridge.watch(True)
             carrying.leading.release()
+
+
+class Led:
+    """Sessions whose frames this thread moves within a ``with`` block: their own threads would be in each other's way.
+
+    Args:
+        carriers: channels of different sessions.
+    """
+
+    def __init__(self, carriers: Sequence[Carrier]) -> None:
+        self._fds = {each._fd for each in carriers}
+        self._sessions = {each._carrying.bridge.link_fd: each._carrying for each in carriers}
+
+    def __enter__(self) -> Self:
+        for fd, carrying in list(self._sessions.items()):
+            if carrying.leading.acquire(False):
+                carrying.bridge.watch(False)
+            else:
+                del self._sessions[fd]  # another thread of the program does
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for carrying in self._sessions.values():
+            carrying.bridge.watch(True)
+            carrying.leading.release()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until an answer has arrived on each channel."""
+        deadline, left, poller = monotonic() + timeout_s, set(self._fds), poll()
+        for fd in (*self._sessions, *left):
+            poller.register(fd, POLLIN)
+        while left and (left_s := deadline - monotonic()) > 0:
+            for fd, _ in poller.poll(1e3 * left_s):
+                if fd in left:
+                    left.remove(fd)
+                    poller.unregister(fd)
+                elif fd in self._sessions:
+                    self._sessions[fd].alone(self._sessions[fd].bridge.serve)

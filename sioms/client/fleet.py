@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 __all__ = ["Fleet", "FleetError", "FleetMarker"]
 THREADS = 64
 """Cells that are waited for side by side; more take turns."""
+MOST_LED_S = 0.05
+"""How long answers of all cells are waited for together [s]; then each by itself."""
 
 
 class _Together:
@@ -27,12 +29,30 @@ class _Together:
         self._threads: ThreadPoolExecutor | None = None
 
     async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+        carriers = [carrier for cell, _ in calls if (carrier := cell._channel.carrier) is not None]
+        if len(carriers) < 2:
+            return self._answers(calls, self._send(calls))
+        from .carrying import Led
+
+        beats_s = [beat_s for cell, _ in calls if (beat_s := cell._channel.keepalive_s)]
+        with Led(carriers) as led:
+            sent = self._send(calls)
+            if not any(isinstance(number, OSError) for number in sent):
+                led.wait(min([MOST_LED_S, *beats_s]))
+        return self._answers(calls, sent)
+
+    def _send(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[int | OSError]:
         sent: list[int | OSError] = []
         for cell, call in calls:
             try:
                 sent.append(cell._channel.send(call))
             except OSError as error:
                 sent.append(error)
+        return sent
+
+    def _answers(
+        self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]], sent: Sequence[int | OSError]
+    ) -> list[Answer | OSError]:
         answers: list[Answer | OSError] = []
         for (cell, call), number in zip(calls, sent, strict=True):
             try:

@@ -12,6 +12,7 @@ Concurrency: one thread a session, and one of the program's at a time, under a l
 
 from __future__ import annotations
 
+import atexit
 import errno
 import os
 import select
@@ -21,31 +22,29 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
-from mmap import mmap
 from typing import Any, Protocol
 
 from sioms.protocol import link
 from sioms.protocol.clock import Clock, Offset, Wall
 from sioms.protocol.flags import PageState
-from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, take_events
-from sioms.protocol.link import Down, MalformedFrame, PageShape, Up, Update
-from sioms.protocol.messages import MAX_PACKET, ClientVerb, MalformedMessage, refusal
-from sioms.protocol.page import REASON_SIZE, PageCopy, page_size
+from sioms.protocol.link import Down, MalformedFrame, Up, Update
+from sioms.protocol.messages import MAX_PACKET, ClientVerb, refusal
+from sioms.protocol.page import REASON_SIZE
 from sioms.protocol.text import printable
 
 from .carrying import ALL, Carrier, Carrying
+from .far import Far, FarJournal
 from .places import place_of
 
-STALE_S = 0.2
-"""How much older than its driver's lease a reading may get on its way [s]; then it is none."""
 FIRST_PINGS = 8
 STOP_AGAIN_S = 0.3
 """A stop that has not been answered on its own way goes the other one, too, after so long [s]."""
 BUSY_S = 6.0
 """How long a gateway may take to begin a session, at least [s]: its machine, or this one, may have too much to do."""
+LEAVE_S = 1.0
+"""How long a program that ends waits for the end of a session [s]."""
 HELLO_AGAIN_S = 0.1
 """How often a greeting is repeated [s]: a transport may not have made our end of the link known yet."""
-_BUFFER = 1 << 19
 
 
 class LinkClock(Clock):
@@ -131,92 +130,8 @@ def connect(address: str, timeout_s: float) -> tuple[Any, LinkClock, Carrier]:
     except BaseException:
         bridge.release()
         raise
-    threading.Thread(target=bridge.run, name=f"sioms {address}", daemon=True).start()
+    bridge.start()
     return theirs, bridge.clock, Carrier(bridge.carrying, 0, theirs)
-
-
-class _Far:
-    """A node at the other end: its page here, and our ends of its sockets."""
-
-    def __init__(self, shape: PageShape) -> None:
-        size = page_size(shape.node_class, shape.channels, shape.slots)
-        self.page_fd = os.memfd_create("sioms-page", os.MFD_CLOEXEC)
-        os.ftruncate(self.page_fd, size)
-        self._map = mmap(self.page_fd, size)
-        lease_ns = shape.lease_ns + int(STALE_S * 1e9)
-        self.shape = shape
-        self.page = PageCopy(
-            memoryview(self._map), shape.node_class, shape.channels, shape.slots, lease_ns, shape.generation,
-            shape.device,
-        )  # fmt: skip
-        self.wake_read, self.wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-        self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        self.ours.setblocking(False)
-        self.theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _BUFFER)
-        self.answer = b""
-        self.unconfirmed = 0
-        self.ended = False
-
-    def hand_over(self, session: socket.socket) -> None:
-        """Pass the program's ends along with the answer to its open."""
-        fds = [self.page_fd, self.wake_read, self.theirs.fileno()]
-        try:
-            socket.send_fds(session, [self.answer], fds)
-        finally:
-            self.answer = b""
-            os.close(self.page_fd)
-            os.close(self.wake_read)
-            self.page_fd = self.wake_read = -1
-            self.theirs.close()
-
-    def wake_up(self) -> None:
-        """Make the program's end of the pipe readable."""
-        with suppress(OSError):  # full, or closed
-            os.write(self.wake, b"\1")
-
-    def close(self) -> None:
-        """Let go of everything; what the program has goes on being there."""
-        self.ours.close()
-        self.theirs.close()
-        for fd in (self.wake, self.page_fd, self.wake_read):
-            if fd >= 0:
-                os.close(fd)
-        self.page.release()
-        self._map.close()
-
-
-class _FarJournal:
-    """A journal at the other end: a copy here, which the program maps."""
-
-    def __init__(self) -> None:
-        self._fd = os.memfd_create("sioms-journal", os.MFD_CLOEXEC)
-        os.ftruncate(self._fd, HEADER + JOURNAL_SIZE)
-        self._map = mmap(self._fd, HEADER + JOURNAL_SIZE)
-        self._writer = JournalWriter(memoryview(self._map))
-        self._leash_read, self._leash = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
-
-    def put(self, events: bytes) -> None:
-        """Add events; raises MalformedFrame."""
-        try:
-            for event in take_events(events):
-                self._writer.put(event)
-        except MalformedMessage as error:
-            raise MalformedFrame(str(error)) from None
-
-    def hand_over(self, session: socket.socket, answer: bytes) -> None:
-        """Pass it along with the answer to its request."""
-        fd = os.open(f"/proc/self/fd/{self._fd}", os.O_RDONLY | os.O_CLOEXEC)
-        try:
-            socket.send_fds(session, [answer], [fd, self._leash_read])
-        finally:
-            os.close(fd)
-
-    def close(self) -> None:
-        """Let go of it; the program reads to the end what it has."""
-        for fd in (self._leash, self._leash_read, self._fd):
-            os.close(fd)
-        self._writer.release()
-        self._map.close()
 
 
 class _Bridge:
@@ -230,11 +145,13 @@ class _Bridge:
         self._number = 0
         self._told_ns = 0
         self._heard_ns = self._pinged_ns = 0
-        self._nodes: dict[int, _Far] = {}
-        self._journals: dict[int, _FarJournal] = {}
+        self._nodes: dict[int, Far] = {}
+        self._journals: dict[int, FarJournal] = {}
         self._by_fd: dict[int, int] = {}
         self._stop: tuple[float, bytes] | None = None
         self._last_word: tuple[int, str] | None = None
+        self._leaves = False
+        self._thread = threading.Thread(target=self.run, name=f"sioms {address}", daemon=True)
         self._due_ns = 0
         self.carrying = Carrying(self)
         self._is_over = False
@@ -289,6 +206,22 @@ class _Bridge:
 
     # --- the thread ------------------------------------------------------------------------------
 
+    def start(self) -> None:
+        """Have the session's own thread move frames from now on."""
+        self._thread.start()
+        atexit.register(self.leave)
+
+    def leave(self) -> None:
+        """End the session with the program, before its thread would be cut off in the midst of a library's work."""
+        if self.carrying.is_a_childs:
+            return
+        with self.carrying.lock:
+            if self._is_over:
+                return
+            self._leaves = True
+            os.eventfd_write(self._spoilt, 1)
+        self._thread.join(LEAVE_S)
+
     def run(self) -> None:
         """Move frames until either side ends the session."""
         signal.pthread_sigmask(signal.SIG_BLOCK, ALL)  # they are for threads of the program
@@ -304,6 +237,8 @@ class _Bridge:
 
     def _turn(self, ready: list[int]) -> bool:
         """Do what descriptors that are ready, and the time, ask for; return whether the session goes on."""
+        if self._leaves:
+            return False
         for fd in ready:
             if fd == self.ours.fileno():
                 if not self._from_program():
@@ -456,13 +391,13 @@ class _Bridge:
                 self.ours.send(body)
             case Down.OPENED:
                 shape, packet = link.take_opened(body)
-                far = self._nodes[channel] = _Far(shape)
+                far = self._nodes[channel] = Far(shape)
                 far.answer = packet
                 self._by_fd[far.ours.fileno()] = channel
                 self._epoll.register(far.ours.fileno(), select.EPOLLIN)
             case Down.FOLLOWED:
                 packet, events = link.take_followed(body)
-                journal = self._journals[channel] = _FarJournal()
+                journal = self._journals[channel] = FarJournal()
                 journal.put(events)
                 journal.hand_over(self.ours, packet)
             case Down.EVENTS if channel in self._journals:
@@ -476,7 +411,7 @@ class _Bridge:
                 word = channel or errno.EIO, printable(body.decode("utf-8", "replace"), 1024)
                 self._last_word = self._last_word or word  # the first says why; what came in between gets another one
 
-    def _confirm(self, far: _Far, handle: int) -> None:
+    def _confirm(self, far: Far, handle: int) -> None:
         """Confirm sets of snapshots: half a window at a time, which spares the gateway every second frame."""
         far.unconfirmed += 1
         if far.unconfirmed >= link.WINDOW // 2:
@@ -488,7 +423,7 @@ class _Bridge:
             journal.close()
         self._journals.clear()
 
-    def _end_of(self, far: _Far, handle: int) -> None:
+    def _end_of(self, far: Far, handle: int) -> None:
         """Let the program find a node's connection ended; its page goes on telling how the device is."""
         fd, far.ended = far.ours.fileno(), True
         if self._by_fd.pop(fd, None) is not None:
@@ -504,7 +439,7 @@ class _Bridge:
         with suppress(ValueError):
             self.clock.offset.exchange(sent_ns, got_ns, answered_ns, self._heard_ns)
 
-    def _publish(self, far: _Far, update: Update) -> None:
+    def _publish(self, far: Far, update: Update) -> None:
         """Write what has been told into the page, the state first: nobody shall take old for good."""
         alive_ns = self.clock.here(update.alive_ns)
         far.page.set_condition(alive_ns, update.driver, update.daemon, update.reason)
@@ -523,6 +458,7 @@ class _Bridge:
             self._is_over = True
             self._tell_end()
         self.carrying.end(self.release)
+        atexit.unregister(self.leave)
 
     def _tell_end(self) -> None:
         """Tell both sides: a thread of the program that moves frames finds it in the socket that it waits for."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from sioms.client.carrying import Carrier
+from sioms.client.carrying import Carrier, Led
 from sioms.client.channel import Call, Channel
 from sioms.client.remote import _Bridge
 from sioms.protocol import link, verbs
@@ -78,9 +78,9 @@ class Rig:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.link = Link()
         self.bridge = _Bridge("zmq://lab2:5770", self.link, ours)
-        self.thread = threading.Thread(target=self.bridge.run, daemon=True)
         self.bridge._heard_ns = self.bridge._pinged_ns = time.monotonic_ns()
-        self.thread.start()
+        self.bridge.start()
+        self.thread = self.bridge._thread
         carrier = Carrier(self.bridge.carrying, 0, theirs)
         self.channel = Channel(theirs, "the gateway", carrier=carrier)
 
@@ -114,7 +114,8 @@ def interrupts() -> Iterator[None]:
 
 def test_who_waits_sends_and_takes_without_another_thread(rig: Rig) -> None:
     assert [rig.ask() for _ in range(20)] == [f"answer {number}" for number in range(1, 21)]
-    assert {*rig.link.by, *rig.link.taken_by} == {threading.get_ident()}
+    assert set(rig.link.by) == {threading.get_ident()}
+    assert rig.link.taken_by.count(threading.get_ident()) > 10, "the session's thread looks now and then"
     assert [number for kind, number in rig.link.sent if kind == Up.PACKET] == list(range(1, 21)), "none is missing"
 
 
@@ -137,6 +138,27 @@ def test_of_many_threads_one_moves_frames_and_all_are_answered(rig: Rig) -> None
     for thread in threads:
         thread.join(20.0)
     assert sorted(answers) == sorted(f"answer {number}" for number in range(1, 201))
+
+
+def test_one_thread_moves_the_frames_of_several_sessions_until_each_is_answered(rig: Rig) -> None:
+    rigs = [rig, Rig(), Rig()]
+    carriers = [carrier for each in rigs if (carrier := each.channel.carrier)]
+    for each in rigs:
+        each.ask()
+        each.link.keeps = True
+    with Led(carriers) as led:
+        numbers = [each.channel.send(Call("list", verbs.List())) for each in rigs]
+        led.wait(0.01)
+        assert all(each.bridge.carrying.leading.locked() for each in rigs)
+        for each, number in zip(rigs, numbers, strict=True):
+            threading.Timer(0.03, each.link.bring, [number]).start()
+        led.wait(20.0)
+        for each in rigs:
+            assert each.channel.take() is not None
+    assert threading.get_ident() in [each.link.taken_by[-1] for each in rigs]
+    assert not any(each.bridge.carrying.leading.locked() for each in rigs), "each has its thread again"
+    for each in rigs[1:]:
+        each.channel.close()
 
 
 @pytest.mark.usefixtures("interrupts")
@@ -196,6 +218,13 @@ def test_a_program_that_drops_its_session_ends_it(rig: Rig) -> None:
     del made
     thread.join(5.0)
     assert not thread.is_alive() and sent[-1][0] == Up.BYE
+
+
+def test_a_program_that_ends_ends_its_session_first(rig: Rig) -> None:
+    rig.ask()
+    rig.bridge.leave()
+    assert not rig.thread.is_alive() and rig.link.sent[-1][0] == Up.BYE
+    rig.bridge.leave()  # again does nothing
 
 
 def test_a_forked_child_is_refused_and_harms_nothing(rig: Rig) -> None:
