@@ -47,8 +47,7 @@ class StopVerbs:
                     errno.EPERM,
                     f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
                 )
-            self._stops.hear_request()
-            self._stops.stop_workcell(source)
+            self._stops.stop_for(session.peer.pid, source)
             return
         node = self._nodes.find(session, "emergency stop", name, message.right)
         try:

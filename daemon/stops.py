@@ -71,6 +71,20 @@ class Stops:
         request.take(mark)
         return "" if heard else source
 
+    def stop_for(self, pid: int, source: str) -> None:
+        """Stop the workcell for a session. A request that its process has made, and nobody heard yet, is the same stop:
+        clients write one ahead, for the drivers, in case that we hang.
+        """
+        request = self._shared.request
+        is_same, mark = request.pid == pid, request.mark
+        if is_same:
+            self._request_seen = mark
+        else:
+            self.hear_request()
+        self.stop_workcell(source)
+        if is_same:
+            request.take(mark)
+
     def reset_workcell(self, who: str) -> None:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
         latched_ns = self._shared.latch.stopped_ns
@@ -167,7 +181,8 @@ class Stops:
         """Wake the other drivers: one has latched the stop of the workcell."""
         self._cell.log("warning", "emergency stop", source=source, device=device.name)
         for other in self._cell.devices.values():
-            other.tell(driver_verbs.StopChanged())
+            if other is not device:
+                other.tell(driver_verbs.StopChanged())
 
     def look_at_inputs(self, device: DriverProcess) -> None:
         """Stop the workcell when an input of a device that is to stop it cannot be read: it may be pressed."""

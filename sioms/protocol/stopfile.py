@@ -58,6 +58,11 @@ class StopRequest:
         text = printable(why.split(b"\0")[0].decode("utf-8", "replace"))
         return f"pid {pid}{': ' + text if text else ''}, through the stop-request page"
 
+    @property
+    def pid(self) -> int:
+        """The process that requested last, as far as it said."""
+        return int.from_bytes(os.pread(self._fd, 8, 8), "little")
+
     def request(self, now_ns: int, pid: int, why: str = "") -> int:
         """Request a stop of the workcell; return the word that stands for it."""
         os.pwrite(self._fd, _REQUEST.pack(now_ns, pid, why.encode()[:239]), 0)

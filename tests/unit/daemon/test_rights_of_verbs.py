@@ -94,6 +94,7 @@ class Workcell:
         self.cell.names, self.cell.devices = NameTable(INFOS, BITS), {"io0": self.device}  # type: ignore[dict-item]
         stops: Any = SimpleNamespace(
             hear_request=str,
+            stop_for=lambda pid, source: self.done.append("stop"),
             stop_workcell=lambda source: self.done.append("stop"),
             reset_workcell=lambda who: self.done.append("reset"),
             stop_node=lambda node, source: self.done.append(f"stop {node.name}"),

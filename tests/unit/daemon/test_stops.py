@@ -1,0 +1,69 @@
+"""The stop of a session and the request that its process has written ahead of it are one stop; another's is another."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from sioms.daemon.cell import Cell
+from sioms.daemon.log import Log
+from sioms.daemon.stops import Stops
+from sioms.protocol.latch import LATCH_SIZE, Latch
+from sioms.protocol.stopfile import StopRequest
+
+PID = 4711
+
+
+class Rig:
+    """The stops of a cell without devices, whose record and log are written down."""
+
+    def __init__(self) -> None:
+        self.fds = [os.memfd_create(name) for name in ("stop", "stopped")]
+        self.request = StopRequest(*self.fds)
+        self.latch = Latch(memoryview(bytearray(LATCH_SIZE)))
+        self.noted: list[str] = []
+        state = SimpleNamespace(workcell="")
+        record = SimpleNamespace(look=lambda: None, state=state, note=self._note, path="stops")
+        shared: Any = SimpleNamespace(latch=self.latch, request=self.request, record=record)
+        cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
+        self.stops, self._state = Stops(cell), state
+
+    def _note(self, entry: dict[str, Any]) -> None:
+        self.noted.append(entry["by"])
+        self._state.workcell = entry["by"]
+
+
+@pytest.fixture
+def rig() -> Iterator[Rig]:
+    made = Rig()
+    yield made
+    made.request.close()
+
+
+@pytest.mark.parametrize("heard_by_a_driver", [False, True])
+def test_a_request_of_the_sessions_process_is_its_stop(rig: Rig, heard_by_a_driver: bool) -> None:
+    word = rig.request.request(1000, PID, "enough")
+    if heard_by_a_driver:
+        rig.latch.stop(1001, rig.request.source)
+    rig.stops.stop_for(PID, "eva: enough")
+    assert rig.latch.stopped_ns and rig.latch.source == "eva: enough" and rig.noted == ["eva: enough"]
+    assert rig.request.taken(word) and not rig.stops.hear_request(), "it has been heard"
+    assert rig.noted == ["eva: enough"]
+
+
+def test_a_request_of_another_process_is_another_stop(rig: Rig) -> None:
+    word = rig.request.request(1000, PID + 1, "fire")
+    rig.stops.stop_for(PID, "eva: enough")
+    assert [each.split(",")[0] for each in rig.noted] == [f"pid {PID + 1}: fire", "eva: enough"]
+    assert rig.request.taken(word)
+
+
+def test_a_session_without_a_request_stops_and_a_later_request_is_heard(rig: Rig) -> None:
+    rig.stops.stop_for(PID, "eva: enough")
+    assert rig.noted == ["eva: enough"]
+    rig.request.request(2000, PID, "again")
+    assert f"pid {PID}: again" in rig.stops.hear_request()
