@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from itertools import cycle
 from typing import Any, Self
 
 import zmq
@@ -30,6 +31,8 @@ from .watching import HISTORY, Watch, halting_ns
 from .workcells import axes, workcell
 
 CHUNK = 100
+PACE_S = 0.01
+"""Between two requests of a program that does something else, too [s]."""
 SPEED = 0.05
 _ECHO = """
 import sys, zmq
@@ -76,20 +79,22 @@ class CurveRoundTrip:
         self._sock.close()
         self._context.term()
 
-    def samples(self, count: int, size: int) -> list[int]:
-        """Return the durations of round trips of packets of a size [ns]."""
+    def samples(self, count: int, size: int, pause_s: float = 0.0) -> list[int]:
+        """Return the durations of round trips of packets of a size, with a pause before each [ns]."""
 
         def trip() -> None:
             self._sock.send(bytes(size))
             self._sock.recv()
 
-        return _times(trip, count)
+        return _times(trip, count, pause_s)
 
 
-def _times(act: Callable[[], object], count: int) -> list[int]:
-    """Return how long each of some acts took [ns]."""
+def _times(act: Callable[[], object], count: int, pause_s: float = 0.0) -> list[int]:
+    """Return how long each of some acts took, with a pause before each [ns]."""
     clock, result = time.perf_counter_ns, []
     for _ in range(count):
+        if pause_s:
+            time.sleep(pause_s)
         begin = clock()
         act()
         result.append(clock() - begin)
@@ -98,14 +103,8 @@ def _times(act: Callable[[], object], count: int) -> list[int]:
 
 def _writes(node: Any, records: list[bytes], pause_s: float) -> list[int]:
     """Return how long each of some writes took, with a pause before each [ns]."""
-    clock, result = time.perf_counter_ns, []
-    for i in range(CHUNK):
-        if pause_s:
-            time.sleep(pause_s)
-        begin = clock()
-        node.write(records[i & 1], replace=True)
-        result.append(clock() - begin)
-    return result
+    turn = cycle(records)
+    return _times(lambda: node.write(next(turn), replace=True), CHUNK, pause_s)
 
 
 def bench_reach(options: Options, report: Report) -> None:
@@ -122,24 +121,23 @@ def bench_reach(options: Options, report: Report) -> None:
 
 
 def _requests(options: Options, report: Report, far: Workcell, near: Workcell) -> None:
-    count = options.count(1_000, 20_000)
+    """Requests one after the other, and one in PACE_S, each in turn with bare round trips at the same pace."""
     records = [command(0, position=p) for p in (1e-4, 0.0)]
-    trips: list[int] = []
-    taken: dict[str, list[int]] = {"request to the daemon": [], "write to acknowledgement": []}
-    local: list[int] = []
-    with CurveRoundTrip() as bare:
-        while len(trips) < count:
-            trips += bare.samples(CHUNK, len(records[0]))
-            taken["request to the daemon"] += _times(lambda: far.info("mod0"), CHUNK)
-            with far.open("mod0", "rw", 1.0) as node:
-                taken["write to acknowledgement"] += _writes(node, records, 0.0)
-            with near.open("mod0", "rw", 1.0) as node:
-                local += _writes(node, records, 3e-4)
-            report.progress(f"reach: {len(trips)} of {count}")
-    base = report.samples("bare CURVE round trip", trips)
-    for name, samples in taken.items():
-        report.samples(f"remote {name}", samples, baseline=base, bars=[Bar("ratio", 2.5)])
-    report.samples("local write, 0.3 ms after the one before", local)
+    for pause_s, how in ((0.0, ", in a row"), (PACE_S, ", one in 10 ms")):
+        count = options.slow(300, 3_000) if pause_s else options.count(1_000, 20_000)
+        trips, asked, written, local = list[int](), list[int](), list[int](), list[int]()
+        with CurveRoundTrip() as bare:
+            while len(trips) < count:
+                trips += bare.samples(CHUNK, len(records[0]), pause_s)
+                asked += _times(lambda: far.info("mod0"), CHUNK, pause_s)
+                for cell, samples, least_s in ((far, written, 0.0), (near, local, 3e-4)):
+                    with cell.open("mod0", "rw", 1.0) as node:
+                        samples += _writes(node, records, max(pause_s, least_s))
+                report.progress(f"reach: {len(trips)} of {count}{how}")
+        base = report.samples(f"bare CURVE round trip{how}", trips)
+        report.samples(f"remote request to the daemon{how}", asked, baseline=base, bars=[Bar("ratio", 2.5)])
+        report.samples(f"remote write to acknowledgement{how}", written, baseline=base, bars=[Bar("ratio", 2.5)])
+        report.samples(f"local write{how}" if pause_s else "local write, 0.3 ms after the one before", local)
 
 
 def _readings(options: Options, report: Report, far: Workcell) -> None:
