@@ -85,7 +85,8 @@ class Page:
     def figure(self, figure: Figure, caption: str = "") -> None:
         """Add a picture."""
         buffer = io.BytesIO()
-        figure.savefig(buffer, format="png", dpi=110, bbox_inches="tight")
+        cut = None if figure.get_layout_engine() else "tight"  # which draws it twice
+        figure.savefig(buffer, format="png", dpi=110, bbox_inches=cut)
         code = base64.b64encode(buffer.getvalue()).decode()
         alt = html.escape(caption, quote=True)
         self._parts.append(

@@ -14,6 +14,7 @@ import shutil
 import signal
 import socket
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -252,6 +253,13 @@ def start() -> Iterator[Callable[..., Running]]:
     yield start_one
     for one in reversed(running):
         one.end()
+
+
+@pytest.fixture
+def without_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Let reports be written as where the extra ``report`` is not installed: drawing takes as long as the analysis."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "matplotlib"] + ["matplotlib"]:
+        monkeypatch.setitem(sys.modules, name, None)
 
 
 @pytest.fixture

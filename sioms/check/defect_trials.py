@@ -21,7 +21,7 @@ from .device import (
     usual_speed,
     wait_told,
 )
-from .line_trials import check_back, disturbed
+from .line_trials import check_back, disturbed, speaks_unasked
 from .motion_trials import forward, run, wait_moving
 from .station import Station, Unanswered, wait_for
 from .trial import Failed, NotApplicable, Trial
@@ -35,6 +35,8 @@ def misframed(station: Station, full: bool) -> str:
     """Add bytes to requests and lose bytes of them: the device must be reached again, by stops above all."""
     if station.rig.line != "serial":
         raise NotApplicable("only a serial line loses and adds bytes")
+    if speaks_unasked(station):
+        raise NotApplicable("the device speaks unasked; it is sent no requests")
     checked = station.rig.checked  # without a checksum a lost digit is another command
     for faults in ({"stray": 0.3}, {"short": 0.3}) if checked else ({"stray": 0.3},):
         disturbed(station, 5.0 if full else 0.5, judge=checked, **faults)
@@ -61,9 +63,9 @@ def misframed(station: Station, full: bool) -> str:
 def frozen(station: Station, full: bool) -> str:
     """Let the readings of a streaming device stand still: that is a lost device, not a quiet one."""
     device = device_with(station, "freeze")
+    if not speaks_unasked(station):
+        raise NotApplicable("the device is asked; that its answers stand still cannot be told from rest")
     with station.cell.open(station.nodes[0].reader) as node:
-        if "stream" not in node.statistics(1):
-            raise NotApplicable("the device is asked; that its answers stand still cannot be told from rest")
         began = time.monotonic()
         device.tell("freeze")
         try:

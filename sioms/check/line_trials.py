@@ -200,9 +200,9 @@ def late(station: Station, full: bool) -> str:
 
 def _timeout(station: Station) -> tuple[float, float]:
     """Return how long the driver waits for a reply, and how long the device needs for one [s]."""
+    if speaks_unasked(station):
+        raise NotApplicable("the device speaks unasked; no reply is waited for")
     with station.cell.open(station.nodes[0].reader) as node:
-        if "stream" in node.statistics(1):
-            raise NotApplicable("the device speaks unasked; no reply is waited for")
         requests = station.messages(200)
         gaps = sorted(b[0] - a[0] for a, b in itertools.pairwise(requests) if a[1] == ">" and b[1] == "<")
         if not gaps:
@@ -313,6 +313,12 @@ def outputs_missing(station: Station, full: bool) -> str:
     if not -axis.tolerance <= moved / step <= 1 + axis.tolerance / abs(step):
         raise Failed(f"a relative move of {step:g} carried out once or not at all", f"the axis moved {moved:g}")
     return f"moved {moved:.4g} of {step:.4g}"
+
+
+def speaks_unasked(station: Station) -> bool:
+    """Whether the device streams its readings, and is asked for none."""
+    with station.cell.open(station.nodes[0].reader) as node:
+        return "stream" in node.statistics(1)
 
 
 def has_class(station: Station, node_class: NodeClass) -> bool:

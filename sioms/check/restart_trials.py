@@ -48,28 +48,25 @@ def stale(station: Station, full: bool) -> str:
     ]
     if "power_cycle" in station.verbs:
         occasions.append(("a power cycle", _supply))
-    goers = [("running", run)]
+    ways = [("running", run, *occasion) for occasion in occasions]
     if station.has(ControlMode.FORCE):
-        goers.append(("pushing", _push))
-    count = 0
-    for name, go in goers:
-        for what, do in occasions:
-            with station.cell.open(axis.node, "rw", timeout=5.0) as node:
-                restore(station, node, axis)
-                go(station, node, axis)
-                if go is run:
-                    wait_moving(station, node.read, axis)
-                else:
-                    time.sleep(0.2)
-                do(station, node, fast)
-                after = f"{what} ({name} before)"
-                check_still(station, fast, WATCH_S, after)
-                reset(node)
-                check_still(station, fast, WATCH_S, f"{after}, and RESET")
-                restore(station, node, axis)
-                check_still(station, fast, WATCH_S, f"{after}, RESET and calibration")
-            count += 1
-    return f"stood still after {count} ways of closing the loop"
+        ways += [("pushing", _push, *occasion) for occasion in (occasions if full else occasions[:1])]
+    for name, go, what, do in ways:
+        with station.cell.open(axis.node, "rw", timeout=5.0) as node:
+            restore(station, node, axis)
+            go(station, node, axis)
+            if go is run:
+                wait_moving(station, node.read, axis)
+            else:
+                time.sleep(0.2)
+            do(station, node, fast)
+            after = f"{what} ({name} before)"
+            check_still(station, fast, WATCH_S, after)
+            reset(node)
+            check_still(station, fast, WATCH_S, f"{after}, and RESET")
+            restore(station, node, axis)
+            check_still(station, fast, WATCH_S, f"{after}, RESET and calibration")
+    return f"stood still after {len(ways)} ways of closing the loop"
 
 
 def _push(station: Station, node: Any, axis: Axis) -> None:

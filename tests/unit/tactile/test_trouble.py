@@ -120,9 +120,9 @@ def cases(*values: Any) -> Any:
     return pytest.mark.parametrize("case", values, ids=str)
 
 
-@cases(*((holes, load) for holes in (range(16), range(2, 15), range(3, 16), range(4, 11)) for load in (0.0, 150.0)))
+@cases((range(16), 150.0), (range(2, 15), 0.0), (range(3, 16), 150.0), (range(4, 11), 0.0), (range(4, 11), 150.0))
 def test_blind_is_not_untouched(case: tuple[range, float]) -> None:
-    """All or most elements read nothing, in the midst of them what is touched: 8 cases."""
+    """All or most elements read nothing, in the midst of them what is touched: 5 cases."""
     holes, load = case
     finger, missing = Finger(seed=len(holes)), np.where(np.isin(np.arange(16), list(holes)), np.nan, 0.0)
     finger.go(0.3, missing + (touch(75.0, load) if load else 0.0))
@@ -137,9 +137,12 @@ def test_blind_is_not_untouched(case: tuple[range, float]) -> None:
     finger.works()
 
 
-@cases(*((step, load, rc) for step in (0.25, 0.5) for load in (100.0, 200.0, 300.0) for rc in (6e-3, 12.3e-3)))
+@cases(
+    *((0.5, load, rc) for load, rc in ((100.0, 6e-3), (100.0, 12.3e-3), (200.0, 6e-3), (300.0, 12.3e-3))),
+    *((0.25, load, rc) for load, rc in ((100.0, 12.3e-3), (200.0, 6e-3))),
+)
 def test_a_held_touch_of_a_coarse_quiet_converter_stays(case: tuple[float, float, float]) -> None:
-    """Every frame of a second and a half is equal, thrice as many as a dead element's: 12 cases."""
+    """Every frame of a second and a half is equal, thrice as many as a dead element's: 6 cases."""
     step, load, rc = case
     finger = Finger(noise=0.02, step=step, seed=3)
     assert {State.UNTOUCHED} == {state_of(Quality(int(finger.go(0.5)["quality"])))}
@@ -150,9 +153,9 @@ def test_a_held_touch_of_a_coarse_quiet_converter_stays(case: tuple[float, float
     assert finger.go(0.2)["load"] == 0.0
 
 
-@cases(*((element, jump) for element in (0, 5, 8, 15) for jump in (5.0, -5.0, 1.0)))
+@cases((0, 5.0), (5, -5.0), (8, 5.0), (8, 1.0), (15, -5.0), (15, 1.0))
 def test_an_element_that_moves_alone_is_no_touch(case: tuple[int, float]) -> None:
-    """At rest, under a true touch while it is away, and back: 12 cases."""
+    """At rest, under a true touch while it is away, and back: 6 cases."""
     element, jump = case
     finger = Finger(seed=element)
     off = jump * np.eye(16)[element]
@@ -185,15 +188,9 @@ def test_a_step_of_all_elements_is_no_touch_and_leaves_nothing(case: tuple[float
     finger.works()
 
 
-@cases(
-    *(
-        (load, rc, place)
-        for load, rc in ((400.0, math.inf), (450.0, 12.3e-3), (400.0, 6e-3), (250.0, math.inf))
-        for place in (50.0, 78.0)
-    )
-)
+@cases((400.0, math.inf, 50.0), (450.0, 12.3e-3, 78.0), (400.0, 6e-3, 50.0), (250.0, math.inf, 78.0))
 def test_r_is_within_its_deviation_at_high_loads(case: tuple[float, float, float]) -> None:
-    """Wide contacts: 8 cases."""
+    """Wide contacts: 4 cases."""
     load, rc, place = case
     finger = Finger(seed=int(load))
     finger.go(0.5, touch(place, load, rc))
@@ -204,9 +201,9 @@ def test_r_is_within_its_deviation_at_high_loads(case: tuple[float, float, float
     assert State.DOUBTFUL not in finger.states
 
 
-@cases(*((load, place) for load in (-30.0, -150.0, -400.0) for place in (20.0, 75.0, 79.6)))
+@cases((-30.0, 20.0), (-30.0, 79.6), (-150.0, 75.0), (-400.0, 20.0), (-400.0, 79.6))
 def test_a_pull_is_called_one(case: tuple[float, float]) -> None:
-    """Something sticks and pulls: 9 cases."""
+    """Something sticks and pulls: 5 cases."""
     load, place = case
     finger = Finger(seed=-int(load))
     finger.go(0.3, touch(place, load))
