@@ -121,7 +121,8 @@ def run_steps(steps: list[Step], *, beside: Sequence[Step] = (), then: Sequence[
     results = [run_again(result) for result in results]
     for step, code, seconds in results:
         nothing_there = is_pytest(step) and code == 5  # a folder may have no tests
-        say(f"{'ok    ' if code == 0 or nothing_there else 'FAILED'} {seconds:6.1f} s  {step[0]}")
+        verdict = "ok    " if code == 0 or nothing_there else "FAILED"
+        say(f"{verdict} {seconds:6.1f} s, {USED_S.get(step[0], 0.0):6.1f} s of processors  {step[0]}")
     return 0 if all(code == 0 or (is_pytest(step) and code == 5) for step, code, _ in results) else 1
 
 
@@ -164,6 +165,8 @@ def without_workers(command: list[str]) -> list[str]:
     return command
 
 
+USED_S: dict[str, float] = {}
+"""Processor time of each step, with all processes that it has started and seen end [s]: what both lanes share."""
 RUNNING: set[int] = set()
 """Process groups of the steps that run beside others."""
 ENDING, ALONE_AT_LAST = threading.Event(), threading.Event()
@@ -238,13 +241,13 @@ def run_step(name: str, command: list[str], *, beside: bool = False) -> int:
                 if select.select([output], [], [], 1.0)[0]:  # noqa: TID251 - imports nothing of SIOMS
                     data = os.read(output, 65536)
                     if not data:
-                        return process.wait()
+                        return status_of(name, process)
                     kept += data
                     if not beside:
                         show(kept)
                     quiet_s, last = 0.0, time.monotonic()
-                elif process.poll() is not None:
-                    return process.returncode  # something that it has left behind keeps our end open
+                elif os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT):
+                    return status_of(name, process)  # something that it has left behind keeps our end open
                 now = time.monotonic()
                 quiet_s += (now - last) / max(1.0, os.getloadavg()[0] / (os.cpu_count() or 1))
                 last = now
@@ -257,6 +260,14 @@ def run_step(name: str, command: list[str], *, beside: bool = False) -> int:
             if kept:
                 print(f"{name}:", flush=True)
                 show(kept)
+
+
+def status_of(name: str, process: subprocess.Popen[bytes]) -> int:
+    """Wait for the end of a step; note what it has used of the processors, and return its exit status."""
+    _, status, used = os.wait4(process.pid, 0)
+    process.returncode = os.waitstatus_to_exitcode(status)
+    USED_S[name] = used.ru_utime + used.ru_stime
+    return process.returncode
 
 
 def show(text: bytearray) -> None:

@@ -70,6 +70,16 @@ def test_steps_beside_others_give_way_fail_the_run_and_are_shown_whole(tmp_path:
     assert "ok " in said.err and "FAILED" in said.err
 
 
+def test_the_table_tells_what_a_step_has_used_with_what_it_has_started(capfd: Any) -> None:
+    busy = "import time\nwhile time.process_time() < 0.3: pass"
+    started = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {busy!r}])"
+    steps = [("busy", script(started)), ("idle", script("import time; time.sleep(0.3)")), ("fails", script("exit(7)"))]
+    assert suite.run_steps(steps) == 1
+    assert suite.USED_S["busy"] > 0.3 > suite.USED_S["idle"] > 0.0
+    said = capfd.readouterr().err
+    assert f"{suite.USED_S['busy']:6.1f} s of processors  busy" in said and "FAILED" in said
+
+
 def test_a_command_that_is_not_there_fails_the_run_with_a_sentence(capfd: Any) -> None:
     there = ("there", script("print('done')"))
     assert suite.run_steps([there], beside=[("style", ["/nowhere/ruff"]), there]) == 1
