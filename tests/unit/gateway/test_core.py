@@ -14,6 +14,7 @@ from sioms.gateway.core import (
     MOST_OF_A_KEY,
     MOST_SESSIONS,
     OWN_NUMBERS,
+    READ,
     TOLD,
 )
 from sioms.gateway.parts import Principal
@@ -57,6 +58,36 @@ def test_a_client_says_nothing_in_the_gateways_name(world: World) -> None:
     world.begin(b"b")
     world.ask(b"b", OWN_NUMBERS + 5, verbs.List())
     assert b"b" not in world.gateway.sessions
+
+
+def test_what_the_daemon_alone_reads_is_passed_on_as_it_is(world: World) -> None:
+    line = world.begin(b"a")
+    info = verbs.Info("mod0").packed(2**32 - 1)
+    passed = [verbs.List().packed(2), info, info[:-1], info + b"more"]  # what is damaged is the daemon's to judge
+    for packet in passed:
+        world.frame(b"a", Up.PACKET, 0, packet)
+    assert line.got[-len(passed) :] == passed
+
+
+@pytest.mark.parametrize("how", ["as clients do", "longer"])
+def test_what_the_gateway_reads_it_reads_however_it_is_packed(world: World, how: str) -> None:
+    def packed(packet: bytes) -> bytes:
+        return packet if how == "as clients do" else b"\xdc\x00" + bytes((packet[0] & 15, 0xCC)) + packet[1:]
+
+    line = world.begin(b"a")
+    told_ns, got = world.told(b"a"), len(line.got)
+    world.now_ns += 500 * MS
+    world.frame(b"a", Up.PACKET, 0, packed(verbs.Supervise(2.0).packed(3)), stamp_ns=told_ns)
+    assert [tuple(verbs.take(each, verbs.FROM_CLIENT)[1]) for each in line.got[got:]] == [(1.5,)]
+    samples = {
+        verbs.Represent: ("root", "here", []), verbs.Supervise: (1.0,), verbs.Journal: ("mod0",), verbs.Cancel: (7,),
+        verbs.Open: ("mod0", 3, 0.0, 0.0), verbs.List: (),
+    }  # fmt: skip
+    assert samples.keys() == {*READ, verbs.List}
+    for name, fields in samples.items():  # none of them with a number that is the gateway's
+        line = world.begin(name.__name__.encode())
+        world.frame(name.__name__.encode(), Up.PACKET, 0, packed(name(*fields).packed(OWN_NUMBERS + 1)))
+        assert name.__name__.encode() not in world.gateway.sessions and len(line.got) == 2
 
 
 @pytest.mark.parametrize(("asked_s", "gets_s"), [(0.0, link.DEFAULT_LEASE_S), (2.0, 2.0)])
