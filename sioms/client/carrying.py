@@ -16,6 +16,11 @@ import threading
 from _signal import (  # type: ignore[import-not-found]  # that of ``signal`` makes an enumeration of each number
     SIG_BLOCK,
     SIG_SETMASK,
+    SIGABRT,
+    SIGBUS,
+    SIGFPE,
+    SIGILL,
+    SIGSEGV,
     pthread_sigmask,
     valid_signals,
 )
@@ -27,7 +32,8 @@ from typing import TYPE_CHECKING, Protocol, Self
 if TYPE_CHECKING:
     from _socket import socket
 
-ALL = valid_signals()
+ALL = valid_signals() - {SIGABRT, SIGBUS, SIGFPE, SIGILL, SIGSEGV}
+"""Signals that are held back: all but those of a crash, which somebody may want to be told of."""
 WHY_MS = 1000
 """How long the session's own thread may take to say why a channel has ended [ms]."""
 END_S = 5.0

@@ -188,6 +188,15 @@ def test_a_signal_while_a_frame_is_moved_comes_after_that(rig: Rig) -> None:
     assert [number for kind, number in rig.link.sent if kind == Up.PACKET] == [1, 2]
 
 
+def test_no_signal_is_for_the_sessions_thread_but_those_of_a_crash(rig: Rig) -> None:
+    rig.ask()
+    with open(f"/proc/self/task/{rig.thread.native_id}/status") as file:
+        blocked = int(next(line.split()[1] for line in file if line.startswith("SigBlk")), 16)
+    held = {number for number in range(1, 32) if blocked >> (number - 1) & 1}
+    assert {signal.SIGINT, signal.SIGTERM, signal.SIGALRM, signal.SIGUSR1} <= held
+    assert not held & {signal.SIGSEGV, signal.SIGABRT, signal.SIGBUS}
+
+
 def test_what_raises_while_a_frame_is_moved_all_the_same_ends_the_session(rig: Rig) -> None:
     def during() -> None:
         raise Interrupted
