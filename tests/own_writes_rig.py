@@ -261,7 +261,10 @@ class World:
                 steps, 0, 1, 2, CONTROL, runtime._latch_words, runtime.period_ns, runtime._lead_ns,
                 runtime._daemon_lease_ns, runtime._idling, instants, runtime.pages, runtime.stops, runtime.waits,
                 runtime.clients, runtime.statistics,
-                WriteDesk(runtime.blocks, runtime.clients, runtime.stops, runtime.pages, runtime._request_fd, False),
+                WriteDesk(
+                    runtime.blocks, runtime.clients, runtime.stops, runtime.pages, runtime._request_fd, False,
+                    runtime.period_ns,
+                ),
             )  # fmt: skip
 
     def _wait_for(self, poll: int, ready: Any, timeout_ms: int) -> int:

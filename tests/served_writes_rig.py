@@ -135,7 +135,7 @@ class Served:
             first=row(1, count=MOST_WRITERS), known=row(len(AXES), count=MOST_WRITERS), axes=row(1, *AXES, count=4),
             heard=row(count=MOST_WRITERS), request=request, word=0, changed=changed_ns(request), gives_way=0,
             packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, size=row(), writer=row(), came=row(),
-            effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0,
+            effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0, grace_ns=0,
             reply=np.zeros(REPLY, dtype=np.uint8),
         )  # fmt: skip
 

@@ -22,6 +22,11 @@ if TYPE_CHECKING:
     from .stops import Stops
 
 
+GRACE_NS = 250_000
+"""How long after a packet the loop leaves its client a processor, where a tick later is soon enough."""
+SOON_NS = 1_000_000
+
+
 class WriteDesk:
     """Lends the writers of a device's first axes to steps.
 
@@ -31,11 +36,12 @@ class WriteDesk:
         stops, pages: of the process.
         request: descriptor of the stop-request file; below 0: no writes are served by steps.
         gives_way: whether processes of the same priority may run after every packet.
+        period_ns: of its ticks [ns].
     """
 
     def __init__(
         self, blocks: Sequence[AnyBlock], clients: Attachments, stops: Stops, pages: Pages, request: int,
-        gives_way: bool,
+        gives_way: bool, period_ns: int,
     ) -> None:  # fmt: skip
         self._clients, self._stops, self._pages = clients, stops, pages
         self._writers: list[Handle] = []
@@ -53,6 +59,7 @@ class WriteDesk:
         self.record = Desk(
             plain=plain, count=0, fds=row(MOST_WRITERS), first=row(MOST_WRITERS), known=row(MOST_WRITERS),
             axes=row(axes[0].n), heard=row(MOST_WRITERS), request=request, word=0, changed=0, gives_way=int(gives_way),
+            grace_ns=GRACE_NS if period_ns <= SOON_NS else 0,
             packets=self._packets, kept=0, size=row(MOST_KEPT), writer=row(MOST_KEPT),
             came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
             replace=0, at=0, records=0, reply=np.zeros(REPLY, dtype=np.uint8),

@@ -242,14 +242,28 @@ def is_called(q: Quiet) -> int:
 
 
 @step
+def is_asked(q: Quiet) -> int:
+    """Return whether something has been asked for that comes before the writes of clients."""
+    return q.heeded_ns or q.latch[STOPPED] or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders
+
+
+@step
+def may_wait(q: Quiet, now_ns: int) -> int:
+    """Return whether a tick may come before writes that have been served a moment ago: the loop, which works them in,
+    takes long, and their client has yet to get its answer, which may be on this processor.
+    """
+    return now_ns - q.desk.came[0] < q.desk.grace_ns and not is_asked(q)
+
+
+@step
 def may_tick(q: Quiet, now_ns: int) -> int:
     """Return whether there is nothing that the loop has to see to before a tick.
 
     A stop is begun; orders that come behind it have time. Who waits for its turn ticks on before an order, and before a
     reset as one who is stopped; one who has missed a stop and its reset does not. Writes that have been served
-    are worked in by the loop.
+    are worked in by the loop, where they may not wait.
     """
-    if q.desk.kept:
+    if q.desk.kept and not may_wait(q, now_ns):
         return 0
     if q.latch[RESETS] != q.resets:
         if not q.patient or not q.stopped:
@@ -268,7 +282,9 @@ def may_tick(q: Quiet, now_ns: int) -> int:
 def early_tick(q: Quiet) -> int:
     """Do a tick off the grid, after a stop; return what has become of what announced it."""
     now_ns = clock_ns()
-    if not may_tick(q, now_ns) or q.tick(q.device, now_ns, q.heeded_ns if q.heeded_ns else now_ns, q.number + 1):
+    if q.desk.kept or not may_tick(q, now_ns):
+        return LEFT
+    if q.tick(q.device, now_ns, q.heeded_ns if q.heeded_ns else now_ns, q.number + 1):
         return LEFT
     q.early_ns = 0
     q.began_ns = now_ns
@@ -286,7 +302,10 @@ def one_tick(q: Quiet) -> int:
         return LEFT
     count = q.announced if q.announced else q.expired
     scheduled_ns = q.scheduled_ns + count * q.period_ns * q.periods
-    if q.tick(q.device, scheduled_ns, q.heeded_ns if q.heeded_ns else began_ns, q.number + 1):
+    as_of_ns = q.heeded_ns if q.heeded_ns else began_ns
+    if q.desk.kept:
+        as_of_ns = q.desk.came[0]
+    if q.tick(q.device, scheduled_ns, as_of_ns, q.number + 1):
         return LEFT
     q.early_ns = 0
     q.ticked_ns = scheduled_ns
@@ -355,7 +374,7 @@ def serve_writer(q: Quiet, who: int) -> int:
     """Serve the next packet of a writer, unless something has been asked for that comes before it; return what has
     become of it.
     """
-    if q.heeded_ns or q.latch[STOPPED] or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders:
+    if is_asked(q):
         return LEFT
     return LEFT if serve_packet(q.desk, who, q.number) else DONE
 

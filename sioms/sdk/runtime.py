@@ -273,7 +273,9 @@ class Runtime:
         if self._stops_workcell or self.pages.watch or not self.sees_requests:
             return None
         request = self._request_fd if self._is_alone else -1
-        desk = WriteDesk(self.blocks, self.clients, self.stops, self.pages, request, self.turns.gives_way)
+        desk = WriteDesk(
+            self.blocks, self.clients, self.stops, self.pages, request, self.turns.gives_way, self.period_ns
+        )
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._control.fileno(),
             self._latch_words, self.period_ns, self._lead_ns, self._daemon_lease_ns, self._idling, self.pages,

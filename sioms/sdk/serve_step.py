@@ -2,7 +2,8 @@
 what a gateway says ahead of one: how old the word of its client is.
 
 What is not the plain case stays in the socket, untouched, for the loop (attachments.py): it is the only one that
-refuses. A write that is kept here is worked in by the loop before anything else happens to the bank, the next tick too.
+refuses. A write that is kept here is worked in by the loop before anything else happens to the bank, the next tick too,
+unless that follows at once.
 """
 
 from __future__ import annotations
@@ -57,6 +58,8 @@ class Desk(Record):
 
     ``heard``: the instant that the newest Heard of each writer tells, never one that has yet to come; 0: none came.
 
+    A tick that comes less than ``grace_ns`` behind the first packet that is kept may come before it.
+
     ``kept`` packets lie in ``packets``, each in ROOM bytes, with its ``size``, its ``writer``, when it ``came`` and
     took ``effect``, how long serving it ``took`` [ns], and whether its answer could be ``sent``; they hold
     ``waiting`` commands. ``at`` and ``records`` are the place in, and the bytes of, the packet that is looked at.
@@ -73,6 +76,7 @@ class Desk(Record):
     word: int
     changed: int
     gives_way: int
+    grace_ns: int
     packets: Bytes
     kept: int
     size: Integers

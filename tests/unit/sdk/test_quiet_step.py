@@ -92,8 +92,9 @@ class Device:
             given[name] = function if library is None else Function(function)
         self.quiet = Quiet(**{**given, **fields})
 
-    def _tick(self, _device, scheduled_ns, _began_ns, number):
+    def _tick(self, _device, scheduled_ns, as_of_ns, number):
         self.ticks.append((scheduled_ns, number))
+        self.shown_ns = as_of_ns
         return self.answer
 
     def _slack(self, _device, _now_ns, _due_ns, _):
@@ -364,6 +365,35 @@ def test_a_write_is_served_and_the_tick_that_carries_it_out_is_the_loops(writing
     assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0))
     assert device.quiet.left and device.quiet.expired == 1
     assert len(device.ticks) == 1, "it has to work in what was written first"
+
+
+def test_a_tick_that_follows_at_once_leaves_the_client_its_turn_and_shows_what_was_before_the_write(writing):
+    device, served = writing
+    served.desk.grace_ns = 10_000_000_000
+    served.ours.send(plain_write(served))
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0
+    assert len(device.ticks) == 1 and served.desk.kept == 1, "it is still to be worked in"
+    assert device.shown_ns == served.desk.came[0] < served.desk.effect[0]
+    served.desk.grace_ns = 0
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) and len(device.ticks) == 1
+
+
+@pytest.mark.parametrize("what", [STOPPED, RESETS, ORDERS, "heeded"])
+def test_no_tick_comes_before_a_write_when_something_was_asked_for_behind_it(writing, what):
+    device, served = writing
+    served.desk.grace_ns = 10_000_000_000
+    served.ours.send(plain_write(served))
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0
+    if what == "heeded":
+        device.quiet.heeded_ns = 1
+    else:
+        device.latch[what] += 1
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0))
+    assert not device.ticks and not device.latched and device.quiet.expired == 1
 
 
 def test_the_work_before_a_rare_tick_is_the_loops_when_something_was_written(make, writing):
