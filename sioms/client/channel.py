@@ -303,11 +303,12 @@ class Channel:
         return message[3]
 
     def _lead(self) -> int:
-        """Begin to read for all threads; return the number of a request, 0 when somebody else reads or nothing has yet
-        been asked.
+        """Begin to read for all threads; return the number of a request, 0 when somebody else reads, nothing has yet
+        been asked, or the socket would wait for longer than leases may.
         """
         with self._mutex:
-            if self._reading or self._ended is not None or not self._timeout:
+            is_late = 0 < self.keepalive_s < self._timeout - _STEP_S
+            if self._reading or self._ended is not None or not self._timeout or is_late:
                 return 0
             self._reading = True
             self._number += 1

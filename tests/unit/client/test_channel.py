@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import _socket
+import contextlib
 import errno
 import os
 import socket
@@ -307,6 +308,32 @@ def test_a_short_call_that_is_late_is_told_in_time_and_cancelled(peer: Peer) -> 
     assert isinstance(peer.join()["late"], OSError) and time.monotonic() - began_s < 8.0
     verb, _, *what = decode(peer.sock.recv(65536))
     assert (verb, what) == (ClientVerb.CANCEL, [number])
+
+
+def test_no_short_call_waits_for_longer_than_a_lease_that_has_come_since(peer: Peer) -> None:
+    def write(word: str) -> int:
+        def call() -> Call:
+            others.append(word)
+            return Call("write", Write(1, 30.0, b"data"), limit_s=30.0)
+
+        return peer.start(word, lambda: peer.channel.short_call((1, 1, 30.0, b"data"), call))
+
+    others: list[str] = []  # went the way that tells meanwhile that it lives
+    acquainted(peer)
+    peer.channel.keepalive_s = 0.05
+    number = write("first")
+    assert others == ["first"], "the socket would wait for a second"
+    assert peer.sock.recv(65536) == KEEPALIVE
+    peer.sock.send(reply(number, 7, 1))
+    assert peer.join()["first"] == 7
+    peer.sock.setblocking(False)
+    with contextlib.suppress(BlockingIOError):
+        while peer.sock.recv(65536) == KEEPALIVE:
+            pass
+    peer.sock.settimeout(10.0)
+    assert write("second") == number + 1
+    peer.sock.send(reply(number + 1, 8, 2))
+    assert peer.join()["second"] == 8 and others == ["first"]
 
 
 def test_short_calls_of_many_threads_each_get_their_own_answer(peer: Peer) -> None:
