@@ -1,6 +1,6 @@
 """Find where simulation and measurement disagree, name the missing effect, add it, show the gap shrink.
 
-The library face, alike for a motor axis, a tactile finger and a force sensor: read data and model, analyse, report.
+The library face, alike for axes, tactile fingers, force sensors and hands: read data and model, analyse, report.
 
 >>> from pathlib import Path
 >>> from sioms import reconcile
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from sioms.reconcile.files.axis import read_data, read_model
     from sioms.reconcile.files.finger import reconcile_tactile
     from sioms.reconcile.files.force import reconcile_force
+    from sioms.reconcile.files.hand import reconcile_hand
     from sioms.reconcile.model import AxisModel, Controller
     from sioms.reconcile.model_file import write_model
     from sioms.reconcile.prepare import Options
@@ -36,8 +37,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "AxisModel", "BadInputError", "Controller", "Estimate", "Gap", "NamedEffect", "Options", "Outcome", "Place",
-    "Record", "Session", "Verdict", "analyse", "read_data", "read_model", "reconcile_force", "reconcile_tactile",
-    "write_model", "write_report",
+    "Record", "Session", "Verdict", "analyse", "read_data", "read_model", "reconcile_force", "reconcile_hand",
+    "reconcile_tactile", "write_model", "write_report",
 ]  # fmt: skip
 
 _WHERE = {
@@ -46,6 +47,7 @@ _WHERE = {
     "files.axis": ("read_data", "read_model"),
     "files.finger": ("reconcile_tactile",),
     "files.force": ("reconcile_force",),
+    "files.hand": ("reconcile_hand",),
     "model": ("AxisModel", "Controller"),
     "model_file": ("write_model",),
     "prepare": ("Options",),

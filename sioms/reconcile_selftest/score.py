@@ -93,7 +93,7 @@ def is_right(hidden: Hidden, answer: Mapping[str, Any]) -> bool:
             return verdict == "none" and not got
         case "confounded":
             sets = [got, *(set(a) for a in answer["alternatives"])]
-            both = truth in sets and {hidden.rival} in sets
+            both = truth in sets and set(hidden.rival.split(" + ")) in sets
             return verdict == "ambiguous" and both and bool(answer["separating_experiment"])
         case "unknown":
             return verdict == "unexplained" and got == truth

@@ -1,4 +1,4 @@
-"""Score verdicts on hidden fingers and force sensors against the truth."""
+"""Score verdicts on hidden fingers, force sensors and hands against the truth."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import numpy as np
 
 from sioms.reconcile_selftest.finger_draw import HiddenFinger
 from sioms.reconcile_selftest.force_world import COMPONENTS, HiddenSensor
+from sioms.reconcile_selftest.hand_world import PRIMARY as OF_HANDS
+from sioms.reconcile_selftest.hand_world import HiddenHand
 from sioms.reconcile_selftest.score import Scored, is_right
 
 #: The parameter that says how large an effect is.
@@ -32,10 +34,11 @@ PRIMARY = {
     "offset_drift": "d",
     "hysteresis": "b",
     "temperature": "k",
+    **OF_HANDS,
 }
 
 
-def score_sensor(hidden: HiddenFinger | HiddenSensor, answer: Mapping[str, Any]) -> Scored:
+def score_sensor(hidden: HiddenFinger | HiddenSensor | HiddenHand, answer: Mapping[str, Any]) -> Scored:
     """Score one verdict (the parsed verdict.json)."""
     got, truth = tuple(answer["effects"]), set(hidden.named)
     verdict = str(answer["verdict"])

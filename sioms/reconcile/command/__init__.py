@@ -35,8 +35,9 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         )
         of.add_argument("--seed", type=whole(), default=1, help="seed of permutations and bootstrap")
         of.add_argument("--quiet", action="store_true", help="do not show progress")
-        group.add_argument("--yes", action="store_true", help="move without asking")
-        group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
+        if subject.live is not None:
+            group.add_argument("--yes", action="store_true", help="move without asking")
+            group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
     draft = kinds.add_parser(
         "describe", help="inspect records, draft columns.toml and nominal.toml, and list open questions"
     )
@@ -51,7 +52,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
     test.add_argument(
         "kind",
         nargs="?",
-        choices=("axis", "tactile", "force"),
+        choices=("axis", "tactile", "force", "hand"),
         default="axis",
         help="subject to generate (default axis)",
     )
@@ -133,8 +134,8 @@ def reconcile(args: argparse.Namespace, subject: Subject, say: Say) -> int:
     from sioms.reconcile.verdict import EXIT
 
     data: Path = args.data
-    if node := not (data.exists() or data.suffix in SUFFIXES or len(data.parts) > 1):
-        verdict, seconds = _live(args, subject, say)
+    if node := not (subject.live is None or data.exists() or data.suffix in SUFFIXES or len(data.parts) > 1):
+        verdict, seconds = _live(args, subject.live, subject.halted, say)
     else:
         began = time.monotonic()
         verdict = subject.analyse(args, say)
@@ -149,7 +150,7 @@ def installed(args: argparse.Namespace, subject: Subject, verdict: Any) -> str:
     """Install the corrected model, unless something that has no name remains; return a sentence on what was done."""
     from sioms.reconcile.verdict import Outcome
 
-    if verdict.outcome in (Outcome.NAMED, Outcome.NONE):
+    if subject.install is not None and verdict.outcome in (Outcome.NAMED, Outcome.NONE):
         return subject.install(args, verdict)
     left = f"{args.install} is as it was, and what was found is in {args.out}"
     return f"not installed: the verdict is {verdict.outcome.value}; {left}"
@@ -178,7 +179,7 @@ def described(data: Path, out: Path | None) -> int:
     return 0
 
 
-def _live(args: argparse.Namespace, subject: Subject, say: Say) -> tuple[Any, float]:
+def _live(args: argparse.Namespace, live: Any, halted: str, say: Say) -> tuple[Any, float]:
     """Reconcile what is behind a node."""
     from sioms.lab.stopping import ExperimentStopped
     from sioms.reconcile.errors import BadInputError
@@ -188,13 +189,14 @@ def _live(args: argparse.Namespace, subject: Subject, say: Say) -> tuple[Any, fl
             f"reconcile {args.data}: there is no such file or folder; a node needs --model, the nominal model"
         )
     try:
-        return subject.live(args, args.out / "records", say)
+        found: tuple[Any, float] = live(args, args.out / "records", say)
+        return found
     except FileNotFoundError as e:
         raise BadInputError(f"{e.strerror}; nor is there a file or folder {args.data}") from None
     except OSError as e:
         raise ExperimentStopped(e.strerror or str(e)) from e
     except KeyboardInterrupt:
-        raise ExperimentStopped(f"interrupted; {subject.halted}") from None
+        raise ExperimentStopped(f"interrupted; {halted}") from None
 
 
 def _write(args: argparse.Namespace, subject: Subject, verdict: Any, seconds: float) -> None:

@@ -28,7 +28,8 @@ class Subject:
         text: for the list of subjects.
         arguments: adds its own and returns the group of those for a node.
         analyse: DATA to a verdict.
-        live: NODE to a verdict and the seconds of analysis; records go to the folder.
+        live: NODE to a verdict and the seconds of analysis; records go to the folder. None where only recordings are
+            analysed.
         write: writes the corrected model and what else belongs to it.
         install: puts it to work, and says so.
         halted: what an interrupted experiment leaves.
@@ -37,10 +38,10 @@ class Subject:
     text: str
     arguments: Callable[[argparse.ArgumentParser], Any]
     analyse: Callable[[Args, Say], Any]
-    live: Callable[[Args, Path, Say], tuple[Any, float]]
+    live: Callable[[Args, Path, Say], tuple[Any, float]] | None
     write: Callable[[Args, Any], None]
-    install: Callable[[Args, Any], str]
-    halted: str
+    install: Callable[[Args, Any], str] | None
+    halted: str = ""
 
 
 def _axis_arguments(parser: argparse.ArgumentParser) -> Any:
@@ -264,6 +265,25 @@ def _write_force(args: Args, verdict: Any) -> None:
     write_whole(args.out / "model.toml", to_toml(verdict.model))
 
 
+def _hand_arguments(parser: argparse.ArgumentParser) -> Any:
+    parser.add_argument("data", type=Path, metavar="DATA", help="file or folder of recorded grasps")
+    parser.add_argument("--model", type=Path, metavar="FILE", required=True, help="nominal hand (TOML)")
+    return None
+
+
+def _analyse_hand(args: Args, say: Say) -> Any:
+    from sioms.reconcile.files.hand import reconcile_hand
+
+    return reconcile_hand(args.data, args.model, args.seed, say)
+
+
+def _write_hand(args: Args, verdict: Any) -> None:
+    from sioms.reconcile.files.hand import read_model
+    from sioms.reconcile.hand.model_file import to_toml
+
+    write_whole(args.out / "model.toml", to_toml(verdict.model, read_model(args.model)[1]))
+
+
 SUBJECTS = {
     "axis": Subject(
         "a motor axis, from recordings or live",
@@ -291,5 +311,13 @@ SUBJECTS = {
         _write_force,
         _install_model,
         "what pressed is clear or halted",
+    ),
+    "hand": Subject(
+        "a two-fingered hand, from recorded grasps",
+        _hand_arguments,
+        _analyse_hand,
+        None,
+        _write_hand,
+        None,
     ),
 }

@@ -19,6 +19,7 @@ from sioms.reconcile.sensors.effect import SensorEffect, SensorModel
 from sioms.reconcile.sensors.excitation import gate
 from sioms.reconcile.sensors.fit import Fit, half_intervals, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.locate import locate
+from sioms.reconcile.sensors.plausible import termed
 from sioms.reconcile.sensors.refuse import burst_share, smoother_shares
 from sioms.reconcile.sensors.search import Found, Searcher
 from sioms.reconcile.sensors.stand_ins import credible, displaced, ruled
@@ -60,6 +61,8 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
     missing = {n: text for n, text in missing.items() if n not in found.fit.model.effects}
     share, where = _smoothed(subject, searcher, found)
     left = _odd(searcher, found, share, where)
+    if not termed(found.fit.model):  # what looked like bursts may have been explained by names since
+        bursts = min(bursts, _bursts(subject, searcher, found))
     if left:
         found = credible(searcher, found)
         others = [r for r in others if r.effect in found.fit.model.effects]

@@ -23,9 +23,9 @@ WITHOUT_DAEMON = {
     "driver replay", "driver trace", "hand demo", "hand friction", "hand reproduce", "hand slow", "hand trials",
     "key allow", "key list", "key new", "key revoke", "key trust", "log cut", "log export", "log info", "log merge",
     "log plot", "mount", "replay", "reconcile axis", "reconcile describe", "reconcile effects", "reconcile force",
-    "reconcile score", "reconcile selftest", "reconcile tactile", "reconcile watch", "service install",
-    "service remove", "tactile calibrate", "tactile design", "tactile experiment", "tactile reproduce", "tactile score",
-    "tactile shape",
+    "reconcile hand", "reconcile score", "reconcile selftest", "reconcile tactile", "reconcile watch",
+    "service install", "service remove", "tactile calibrate", "tactile design", "tactile experiment",
+    "tactile reproduce", "tactile score", "tactile shape",
 }  # fmt: skip
 """Commands that work without a daemon, wait for it, or ask something else first."""
 READS = {"file", "files", "config", "data", "truth", "trace"}
