@@ -48,6 +48,7 @@ class Rig:
         open_m: d at the start.
         gains: of the controller.
         compiled: the estimator, see `sioms.tactile.estimator.Estimator`; the first takes some seconds.
+        turned_rad: by which each finger is turned on its link, anti-clockwise.
     """
 
     tick_s: float = 2.5e-3
@@ -60,6 +61,7 @@ class Rig:
     open_m: float = 0.17
     gains: Gains = field(default_factory=lambda: Gains(link_m=LINK_M))
     compiled: bool | None = None
+    turned_rad: tuple[float, float] = (0.0, 0.0)
 
 
 @lru_cache(maxsize=4)
@@ -82,7 +84,7 @@ class PlaneHand:
         body: the object.
         pose: x, y [m], angle [rad] of the object at the start; unknown to a skill.
         rig: how the hand is built.
-        mount: of both fingers.
+        mount: of both fingers, or of each.
         seed: of the noise.
         start: hand coordinates at the start, instead of the open hand at the origin.
 
@@ -99,14 +101,15 @@ class PlaneHand:
     """
 
     def __init__(
-        self, body: Body, pose: tuple[float, float, float], rig: Rig = Rig(), mount: Mount | None = None,
+        self, body: Body, pose: tuple[float, float, float], rig: Rig = Rig(),
+        mount: Mount | tuple[Mount, Mount] | None = None,
         seed: int = 0, start: Six | None = None,
     ) -> None:  # fmt: skip
         self.hand, self.rig = Hand(), rig
-        mount = mount or Mount()
+        mounts = mount if isinstance(mount, tuple) else (mount or Mount(),) * 2
         first = start or (0.0, 0.0, 0.0, rig.open_m, NEUTRAL, NEUTRAL)
         self.joints = list(self.hand.inverse(first))
-        self.world = World(body, [mount, mount], [self.joints[:3], self.joints[3:]], pose)
+        self.world = World(body, mounts, [self.joints[:3], self.joints[3:]], pose)
         self.controller = Controller(rig.gains)
         self._arrays = [TactileArray(SHAPE, 1.0, 0.0, rig.noise, rig.resolution, 2 * seed + i) for i in (0, 1)]
         for array in self._arrays:
@@ -151,6 +154,15 @@ class PlaneHand:
         one, two = self.world.fingers
         return grasp_of(one.centre, two.centre, one.phi + one.place[2], two.phi + two.place[2], FINGER_M)
 
+    def beside(self) -> list[float]:
+        """Return the commanded joints [m, rad], and the forces of the object on both fingers [N]."""
+        forces: list[float] = []
+        for finger in self.world.fingers:
+            angle = finger.phi + finger.place[2]
+            c, s = math.cos(angle), math.sin(angle)
+            forces += [finger.tangential * s - finger.normal * c, -finger.normal * s - finger.tangential * c]
+        return [*self.joints, *forces]
+
     def is_held(self) -> bool:
         """Return whether both fingers truly touch the object."""
         return all(finger.normal > 0.0 for finger in self.world.fingers)
@@ -171,7 +183,8 @@ class PlaneHand:
     def _feel(self, index: int) -> Felt:
         """Make a strain frame of a finger's contact and estimate what touches."""
         finger = self.world.fingers[index]
-        self._arrays[index].read(finger.normal, finger.phi, finger.radius_m, self._raw)
+        turned = finger.phi - self.rig.turned_rad[index]
+        self._arrays[index].read(finger.normal, turned, finger.radius_m, self._raw)
         shape = self._estimate.frame(-0.01 * self._raw)
         if not shape.usable:
             return Felt(False if shape.state is State.UNTOUCHED or shape.quality & Quality.WRONG_SIGN else None)

@@ -34,6 +34,7 @@ VERBS: dict[str, Verb] = {
     "roll": Verb("skill", "roll the object until the grasp is parallel"),
     "hold": Verb("skill", "hold for a time, keeping the grasp parallel by rolling"),
     "release": Verb("skill", "open the hand"),
+    "record": Verb("record", "grasp a known object in many ways and record what sioms reconcile hand reads"),
     "slow": Verb("slow", "write the configuration of a simulated hand in slow motion, for a slow or busy machine"),
     "trials": Verb("trials", "grasp random convex objects in a simulated plane and count the outcomes"),
 }

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.hand.grasps import BAR, DISK, Floats, Grasps
 
 ROUNDS = 10
+DONE_NM = 1e-8  # change of torques in a round [N m] after which there is no further one
 SHRINKS, STILL_NM = 0.5, 1e-5  # share by which each round must be nearer, and torque [N m] that counts as none
 STEEPEST = 1.25  # friction angle [rad] up to which a normal force tells the whole one: the atan of 3
 #: Says by parameters how far links are turned and places of contact off [rad], and how much farther than the finger's
@@ -173,8 +174,10 @@ def _rounds(b: HandBelief, g: Grasps, stray: Floats | None) -> Iterator[Touched]
         changes = [still, still, still]
         for response, p in b.responses:
             changes = [a + c for a, c in zip(changes, response(out, g, p), strict=True)]
-        out = _posed(b, g, loose, out.force, out.torque, (changes[0], changes[1], changes[2]))
+        before, out = out, _posed(b, g, loose, out.force, out.torque, (changes[0], changes[1], changes[2]))
         yield out
+        if np.max(np.abs(out.torque - before.torque), initial=0.0) < DONE_NM:
+            return
 
 
 def _posed(

@@ -20,7 +20,8 @@ from sioms.tools.front import main
 WITHOUT_DAEMON = {
     "bench", "blackbox", "check", "demo", "epics", "init", "metrics", "ros2", "serve", "supervise", "wait",
     "cert authority", "cert install", "cert list", "cert request", "cert sign", "driver check", "driver list",
-    "driver replay", "driver trace", "hand demo", "hand friction", "hand reproduce", "hand slow", "hand trials",
+    "driver replay", "driver trace", "hand demo", "hand friction", "hand record", "hand reproduce", "hand slow",
+    "hand trials",
     "key allow", "key list", "key new", "key revoke", "key trust", "log cut", "log export", "log info", "log merge",
     "log plot", "mount", "replay", "reconcile axis", "reconcile describe", "reconcile effects", "reconcile force",
     "reconcile hand", "reconcile score", "reconcile selftest", "reconcile tactile", "reconcile watch",

@@ -1,0 +1,184 @@
+"""``sioms hand record``: grasp a known object in many ways, and write what ``sioms reconcile hand`` reads.
+
+On the hand of a running workcell, or with ``--plane`` on a simulated hand in this process, which may hide effects:
+
+    [finger1]
+    link_m = 0.142           # keys of `sioms.plant.planar.Mount`
+    turned_rad = 0.026       # by which the finger is turned on its link
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from sioms.arguments import positive, whole
+
+if TYPE_CHECKING:
+    from sioms.hand.survey import Setting, Survey, Thing
+
+GRASPS = 20
+MOST_S = 24 * 3600.0
+FINGERS = ("finger1", "finger2")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help="recording to write (CSV)")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--disk", type=positive, metavar="M", help="the object is a disk of this radius in metres")
+    what.add_argument("--bar", type=positive, metavar="M", help="the object is a bar of this width in metres")
+    parser.add_argument("--thing", type=whole(), default=1, metavar="N", help="number of the object (default 1)")
+    parser.add_argument(
+        "--grasps", type=whole(1), default=GRASPS, metavar="N", help=f"number of grasps (default {GRASPS})"
+    )
+    parser.add_argument(
+        "--forces", type=positive, nargs="+", default=[0.5, 1.0, 1.8], metavar="N",
+        help="internal forces of each grasp in newtons (default 0.5 1 1.8)",
+    )  # fmt: skip
+    parser.add_argument("--append", action="store_true", help="continue FILE: another object in the same session")
+    parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="seed of the grasps (default 1)")
+    parser.add_argument("--plane", action="store_true", help="use a simulated hand in this process")
+    parser.add_argument(
+        "--hidden", type=Path, metavar="FILE", help="with --plane: what the simulated hand hides (TOML)"
+    )
+    parser.add_argument("--node", default="hand", metavar="NAME", help="the hand's node (default hand)")
+    parser.add_argument(
+        "--fingers", nargs=2, default=["touch1.shape", "touch2.shape"], metavar="NODE",
+        help="estimate of each finger (default touch1.shape touch2.shape)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--modules", nargs=2, default=["left", "right"], metavar="NODE",
+        help="axes x, y, th of each module (default left right)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--wrists", nargs="*", default=["wrist1", "wrist2"], metavar="NODE",
+        help="force sensor of each wrist, none without a name (default wrist1 wrist2)",
+    )  # fmt: skip
+
+
+def run(args: argparse.Namespace) -> int:
+    """Make the grasps and write them; return 1 if it was broken off, with what was recorded until then written.
+
+    Raises:
+        ValueError: no object, a file that is there, or one that cannot be continued.
+        OSError: a node that is not there, or a hand that was stopped.
+    """
+    from sioms.hand.survey import BAR, DISK, Thing, settings
+    from sioms.hand.touch import Failed
+    from sioms.whole_file import write_whole
+
+    if (args.disk is None) == (args.bar is None):
+        raise ValueError("record grasps: nothing is said of the object; want --disk RADIUS or --bar WIDTH")
+    if len(args.wrists) not in (0, 2):
+        raise ValueError(f"record grasps: {len(args.wrists)} wrists; want two, or --wrists without a name")
+    if args.hidden is not None and not args.plane:
+        raise ValueError("record grasps: --hidden is for a simulated hand; want --plane with it")
+    thing = Thing(DISK, args.disk, args.thing) if args.bar is None else Thing(BAR, args.bar, args.thing)
+    past = earlier(args.output, args.append)
+    plan = settings(args.grasps, args.forces, seed=args.seed)
+    surveys: list[Survey] = []
+    try:
+        (_in_plane if args.plane else _in_cell)(args, thing, plan, int(past[-1][1]) + 1 if past else 0, surveys)
+    except (Failed, TimeoutError) as failed:
+        print(f"sioms hand record: broken off: {failed}", file=sys.stderr)
+    rows = surveys[0].rows if surveys else []
+    for event in surveys[0].events if surveys else []:
+        print(f"{event.time_s:8.2f} s  {event.text}", file=sys.stderr)
+    if rows:
+        began = past[-1][0] if past else 0.0
+        write_whole(args.output, text(past + [[row[0] + began, *row[1:]] for row in rows]))
+    grasps = len({row[1] for row in rows})
+    print(f"{grasps} of {len(plan)} grasps recorded, {len(rows)} rows: {args.output}")
+    return 0 if grasps == len(plan) else 1
+
+
+def text(rows: Sequence[Sequence[float]]) -> str:
+    """Return a recording as CSV."""
+    from sioms.hand.survey import text_of
+
+    return text_of(rows)
+
+
+def earlier(path: Path, append: bool) -> list[list[float]]:
+    """Return the rows of a recording that is continued.
+
+    Raises:
+        ValueError: it is there and not to be continued, or cannot be.
+    """
+    from sioms.hand.survey import rows_of
+
+    if not path.exists():
+        return []
+    if not append:
+        raise ValueError(f"write {path}: it is there; want another name, or --append to continue the same session")
+    try:
+        return rows_of(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise ValueError(f"continue {path}: {error}; want a recording of sioms hand record") from None
+
+
+def _in_plane(
+    args: argparse.Namespace, thing: Thing, plan: Sequence[Setting], first: int, surveys: list[Survey]
+) -> None:
+    """Survey in a simulated plane."""
+    from sioms.hand.plane import PlaneHand, Rig
+    from sioms.hand.survey import DISK, Survey
+    from sioms.plant.outline import disk, rectangle
+    from sioms.plant.planar import Body
+
+    mounts, turned = hidden(args.hidden)
+    outline = disk(thing.size_m) if thing.kind == DISK else rectangle(thing.size_m, 0.08, 2e-3)
+    hand = PlaneHand(Body(outline), (1e-3, -2e-3, 0.02), Rig(turned_rad=turned), mounts, args.seed)
+    surveys.append(Survey(hand.hand, hand.reading, thing))
+    hand.run(surveys[0].carry_out(plan, hand.beside, first), MOST_S)
+
+
+def hidden(path: Path | None) -> tuple[Any, tuple[float, float]]:
+    """Return the mounts of both fingers, and by which they are turned, of a file; the nominal ones without.
+
+    Raises:
+        ValueError: it cannot be read, or a key is not known.
+    """
+    from sioms.documents import read_bytes, toml_of
+    from sioms.plant.planar import Mount
+
+    table: dict[str, Any] = {}
+    if path is not None:
+        try:
+            table = toml_of(read_bytes(path))
+        except OSError as error:
+            raise ValueError(f"read {path}: {error.strerror}") from None
+    odd = sorted(set(table) - set(FINGERS))
+    if odd:
+        raise ValueError(f"read {path}: nobody reads {', '.join(odd)}; known are {', '.join(FINGERS)}")
+    mounts, turned = [], []
+    for name in FINGERS:
+        keys = dict(table.get(name, {}))
+        turned.append(float(keys.pop("turned_rad", 0.0)))
+        try:
+            mounts.append(Mount(**keys))
+        except TypeError as error:
+            raise ValueError(f"read {path}, {name}: {error}") from None
+    return (mounts[0], mounts[1]), (turned[0], turned[1])
+
+
+def _in_cell(
+    args: argparse.Namespace, thing: Thing, plan: Sequence[Setting], first: int, surveys: list[Survey]
+) -> None:
+    """Survey with the hand of a running workcell."""
+    from sioms.client.workcell import Workcell
+    from sioms.hand.live.beside import Beside
+    from sioms.hand.live.cell import MANNER, CellHand
+    from sioms.hand.survey import Survey
+
+    with (
+        Workcell(name="hand") as cell,
+        Beside(cell, args.modules, args.wrists) as beside,
+        CellHand(cell, args.node, args.fingers) as hand,
+    ):
+        surveys.append(Survey(hand.hand, hand.reading, thing, MANNER))
+        hand.run(surveys[0].carry_out(plan, beside.read, first), MOST_S)

@@ -1,0 +1,217 @@
+"""A survey: a known object grasped in many ways and under several loads, recorded for ``sioms reconcile hand``.
+
+    survey = Survey(hand, first_reading, Thing(DISK, 0.02), manner)
+    plane.run(survey.carry_out(settings(20), plane.beside))
+    write(path, survey.rows)
+
+Between grasps the object is turned while it is held, and the fingers are rolled while they are free, so that links and
+fingers are seen from all sides (what decides between look-alikes: docs/reconcile-hand.md). A grasp that fails is left
+out and said in `events`; the object is then sought where it was last.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Generator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from sioms.hand.contacts import FINGER_M
+from sioms.hand.kinematics import Hand
+from sioms.hand.skills import STILL, Skills
+from sioms.hand.touch import Failed, Manner, Reading, Setpoint, State
+
+OTHER, DISK, BAR = 0, 1, 2
+LOADS_N = (0.5, 1.0, 1.8)
+COLUMNS = (
+    "time", "grasp", "kind", "thing", "size", *(f"{joint}{i}" for i in (1, 2) for joint in ("x", "y", "th")), "place1",
+    "place2", "load1", "load2", *(f"cmd_{joint}{i}" for i in (1, 2) for joint in ("x", "y", "th")), "fx1", "fy1", "fx2",
+    "fy2", "slip",
+)  # fmt: skip
+"""Of a recording, as ``sioms reconcile hand`` reads them."""
+PSI, PHI = 1.0, (1.0, 2.1)
+"""Directions of the line of contacts from minus to plus [rad], and angles of the fingers [rad], of a survey."""
+TRIES = 3  # grasps that fail one after the other
+#: What a hand tells beside its readings: commanded joints [m, rad] and the wrists' forces [N]; nan where not known.
+Beside = Callable[[], Sequence[float]]
+
+
+@dataclass(frozen=True, slots=True)
+class Thing:
+    """A known object; immutable.
+
+    Args:
+        kind: DISK, BAR or OTHER.
+        size_m: radius of a disk, width of a bar [m], > 0.
+        number: that records tell it by.
+    """
+
+    kind: int
+    size_m: float
+    number: int = 1
+
+    def __post_init__(self) -> None:
+        if self.kind not in (DISK, BAR) or not 0.0 < self.size_m < 0.5:
+            raise ValueError(f"survey object: kind {self.kind}, size {self.size_m:g} m; want 1 or 2, and 0 to 0.5 m")
+
+    @property
+    def apart_m(self) -> float:
+        """Distance of the contacts of a parallel grasp."""
+        return self.size_m * (2.0 if self.kind == DISK else 1.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Setting:
+    """One grasp: direction of the line of centres and angles of the fingers [rad], and forces [N], rising."""
+
+    psi: float
+    phi1: float
+    phi2: float
+    loads: tuple[float, ...] = LOADS_N
+
+
+def settings(count: int, loads: Sequence[float] = LOADS_N, start: float = 0.0, seed: int = 1) -> list[Setting]:
+    """Return grasps that cover directions and angles evenly, in an order of small turns.
+
+    Args:
+        count: of grasps.
+        loads: forces of each [N], above 0.
+        start: direction about which they lie [rad].
+        seed: of the angles of the fingers.
+    """
+    if not loads or min(loads) <= 0.0:
+        raise ValueError(f"survey object: forces {list(loads)} N; want some above 0")
+    random, (low, high) = np.random.default_rng(seed), PHI
+    turns = start + PSI * np.sin(np.linspace(0.0, 2.0 * math.pi, count, endpoint=False))
+    ranks = [random.permutation(count) for _ in range(2)]
+    phi = [low + (high - low) * (rank + 0.5) / count for rank in ranks]
+    return [Setting(float(t), float(a), float(b), tuple(sorted(loads))) for t, a, b in zip(turns, *phi, strict=True)]
+
+
+class Survey(Skills):
+    """Survey a known object with one hand.  One at a time.
+
+    Args:
+        hand: as the model has it.
+        first: what is read of it at the start.
+        thing: what it is to grasp.
+        manner: how it does it.
+
+    Attributes:
+        rows: recorded so far, by `COLUMNS`.
+    """
+
+    def __init__(self, hand: Hand, first: Reading, thing: Thing, manner: Manner | None = None) -> None:
+        super().__init__(hand, first, manner)
+        self.thing, self.rows = thing, list[list[float]]()
+        self._number = 0
+
+    def carry_out(self, plan: Sequence[Setting], beside: Beside, first: int = 0) -> Generator[Setpoint, Reading, int]:
+        """Make grasps; return how many were recorded.
+
+        Args:
+            plan: the grasps; the object lies between the fingers as they are, a bar with its sides across the line.
+            beside: asked with every frame.
+            first: number of the first grasp.
+
+        Raises:
+            Failed: several grasps one after the other; the hand has opened or is frozen.
+        """
+        self._what = "survey object"
+        middle, failed = self._goal[:2], 0
+        for setting in plan:
+            try:
+                before = len(self.rows)
+                middle = yield from self._one(setting, middle, beside, first + self._number)
+                failed = 0
+                self._number += 1
+            except Failed as fault:
+                self.say(str(fault), fault.fault)
+                del self.rows[before:]  # half a grasp
+                failed += 1
+                if failed == TRIES:
+                    self.state, self._held = State.FAULT, False
+                    yield Setpoint(self.hand.forward(self.now.joints), STILL, 0.0, frozen=True)
+                    raise
+                yield from self._recover()
+        self.state = State.IDLE
+        return self._number
+
+    def _one(
+        self, setting: Setting, middle: Sequence[float], beside: Beside, number: int
+    ) -> Generator[Setpoint, Reading, list[float]]:
+        """Roll the fingers, close, feel under each force, turn the object towards what comes; return where it is."""
+        opened = self.thing.apart_m + 2.0 * FINGER_M + 2.0 * self.manner.clearance_m
+        target = (middle[0], middle[1], self._goal[2], opened, setting.phi1, setting.phi2)
+        self._check_sensors("survey object")
+        self._check_reach("survey object", target)
+        yield from self._move(target)
+        yield from self._close()
+        yield from self._settle(self.manner.light_n, 0.25)
+        yield from self._turn(setting.psi, setting.loads[0])
+        for force in setting.loads:
+            yield from self._settle(force, 0.4)
+            self.rows.append((yield from self._record(force, beside, number)))
+        seen = self._seen()
+        yield from self._open()
+        return [0.5 * (a + b) for a, b in zip(seen.contact1, seen.contact2, strict=True)]
+
+    def _turn(self, psi: float, force: float) -> Generator[Setpoint, Reading, None]:
+        """Turn the hand with what it holds."""
+        rate = 0.3 * self.manner.turning
+        while abs(left := math.remainder(psi - self._goal[2], math.tau)) > 5e-3:
+            yield from self._follow((0.0, 0.0, math.copysign(min(rate, 3.0 * abs(left)), left), 0.0, 0.0, 0.0), force)
+
+    def _record(self, force: float, beside: Beside, number: int) -> Generator[Setpoint, Reading, list[float]]:
+        """Average frames while the hand keeps still; return a row.
+
+        Raises:
+            Failed: a finger is doubtful in more than half of them.
+        """
+        self.state, count = State.SENSE, self.manner.frames
+        frames = []
+        for _ in range(2 * count):
+            yield from self._tick((0.0, 0.0), force)
+            one, two = self.now.fingers
+            if one.touched and two.touched and not one.doubt and not two.doubt:
+                told = (one.phi, two.phi, one.force, two.force)
+                frames.append([*self.now.joints, *told, *beside()])
+        if len(frames) < count:
+            yield from self._sense(force)  # says which finger, and why
+        mean = np.mean(frames or [[math.nan] * 20], axis=0)
+        thing = float(self.thing.kind), float(self.thing.number), self.thing.size_m
+        return [self.now.time_s, float(number), *thing, *(float(v) for v in mean), 0.0]
+
+    def _recover(self) -> Generator[Setpoint, Reading, None]:
+        """Let go and open."""
+        self.state, self._held = State.FAULT, False
+        yield from self._let_go()
+        yield from self._open()
+
+
+def text_of(rows: Sequence[Sequence[float]]) -> str:
+    """Return a recording as CSV; a column that is nowhere known is left out."""
+    table = np.array(rows, dtype=np.float64).reshape(-1, len(COLUMNS))
+    kept = [i for i, name in enumerate(COLUMNS) if name == "size" or not np.isnan(table[:, i]).all()]
+    lines = [",".join(COLUMNS[i] for i in kept)]
+    lines += [",".join(repr(float(row[i])) for i in kept) for row in table]
+    return "\n".join(lines) + "\n"
+
+
+def rows_of(text: str) -> list[list[float]]:
+    """Return the rows of a recording that `text_of` wrote.
+
+    Raises:
+        ValueError: it has other columns, or no numbers.
+    """
+    head, *lines = text.splitlines() or [""]
+    names = head.split(",")
+    odd = [name for name in names if name not in COLUMNS]
+    if odd or not {"time", "grasp"} <= set(names):
+        raise ValueError(f"its columns are {head[:60]!r}")
+    out = []
+    for line in lines:
+        known = dict(zip(names, map(float, line.split(",")), strict=True))
+        out.append([known.get(name, math.nan) for name in COLUMNS])
+    return out
