@@ -32,6 +32,7 @@ COLUMNS = (
 """Of a recording, as ``sioms reconcile hand`` reads them."""
 PSI, PHI = 1.0, (1.0, 2.1)
 """Directions of the line of contacts from minus to plus [rad], and angles of the fingers [rad], of a survey."""
+SETTLED_S = 1.0  # under each force: while the damper still moves, the joints' damping bears a part of it
 TRIES = 3  # grasps that fail one after the other
 #: What a hand tells beside its readings: commanded joints [m, rad] and the wrists' forces [N]; nan where not known.
 Beside = Callable[[], Sequence[float]]
@@ -151,7 +152,7 @@ class Survey(Skills):
         yield from self._settle(self.manner.light_n, 0.25)
         yield from self._turn(setting.psi, setting.loads[0])
         for force in setting.loads:
-            yield from self._settle(force, 0.4)
+            yield from self._settle(force, SETTLED_S)
             self.rows.append((yield from self._record(force, beside, number)))
         seen = self._seen()
         yield from self._open()

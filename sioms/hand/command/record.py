@@ -83,8 +83,10 @@ def run(args: argparse.Namespace) -> int:
     surveys: list[Survey] = []
     try:
         (_in_plane if args.plane else _in_cell)(args, thing, plan, int(past[-1][1]) + 1 if past else 0, surveys)
-    except (Failed, TimeoutError) as failed:
-        print(f"sioms hand record: broken off: {failed}", file=sys.stderr)
+    except (Failed, OSError, KeyboardInterrupt) as failed:
+        if not (surveys and surveys[0].rows) and not isinstance(failed, Failed):
+            raise
+        print(f"sioms hand record: broken off: {failed or 'interrupted'}", file=sys.stderr)
     rows = surveys[0].rows if surveys else []
     for event in surveys[0].events if surveys else []:
         print(f"{event.time_s:8.2f} s  {event.text}", file=sys.stderr)

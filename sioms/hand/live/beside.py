@@ -29,7 +29,7 @@ class Beside:
 
     def __init__(self, cell: Workcell, modules: Sequence[str], wrists: Sequence[str]) -> None:
         with ExitStack() as stack:
-            self._modules: list[Any] = [stack.enter_context(cell.open(name)) for name in modules]
+            self._modules: list[Any] = [stack.enter_context(cell.open(f"{name}.readonly")) for name in modules]
             self._wrists: list[Any] = [stack.enter_context(cell.open(name)) for name in wrists]
             for node in self._modules:
                 if len(node.read().position) != JOINTS:

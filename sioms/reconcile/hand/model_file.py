@@ -50,9 +50,9 @@ RUBBER = ((0.0, 2.5, 5.0, 10.0, 25.0, 50.0, 100.0, 150.0, 200.0),
 """Line load [N/m] and approach [m] of the source's finger and a flat: the elastic layer of `sioms.plant.skin`."""
 FRICTION = ((0.0, 1 / 12.7e-3, 1 / 2.5e-3, 1 / 0.3e-3), (3.4, 2.0, 2.0, 1.4))
 """1/R [1/m] and coefficient of the source's rubber: table 4.2."""
-PAIRS = ("link_m", "mount_rad", "joint_stiffness", "drive_stiffness")
+OF_BOTH = ("link_m", "mount_rad", "joint_stiffness", "drive_stiffness")
 CURVES = {"rubber_load": "rubber_m", "friction_bend": "friction"}
-KEYS = ("name", "finger_m", "contact_m", "pitch_rad", "carriage_stiffness", *PAIRS, *CURVES, *CURVES.values())
+KEYS = ("name", "finger_m", "contact_m", "pitch_rad", "carriage_stiffness", *OF_BOTH, *CURVES, *CURVES.values())
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,9 +21,8 @@ from sioms.reconcile.refuse import hats, knots
 from sioms.reconcile.sensors.analyse import Options, analyse
 from sioms.reconcile.sensors.effect import SensorModel
 from sioms.reconcile.sensors.screen import screening_columns
-from sioms.reconcile.sensors.subject import Variable, View, by_chance
+from sioms.reconcile.sensors.subject import Variable, View
 from sioms.reconcile.sensors.verdict import Curve, Proposal, SensorVerdict
-from sioms.reconcile.thresholds import SHARPER
 from sioms.reconcile.verdict import NamedEffect
 
 TITLES = {
@@ -38,7 +37,7 @@ TITLES = {
 SPANNED = 1e-2  # share of what is fitted that is no further number
 LEAST_FREE = 20  # rows of a view beyond what is fitted that tell its scatter
 TAILS = 1.5  # times the middle of what is left that its root mean square may be, and still be noise
-LEAST, WORST = 0.2, 3.0  # times its stated noise that a view may scatter
+LEAST, WORST = 0.5, 3.0  # times its stated noise that a view may scatter
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,14 +93,8 @@ class HandSubject:
         ]
 
     def sharpened(self, model: SensorModel, shares: Mapping[int, float]) -> HandSubject | None:
-        """Return the hand with the noise told beside a model, where that is far less."""
-        d = self.whole
-        scale = scatter(d, model) * by_chance(len(d.grasps))
-        if not (scale < SHARPER).any():
-            return None
-        factor = np.where(scale < SHARPER, scale, 1.0)
-        whole, training, final = _parts(d.with_sigma(d.sigma * factor[d.view]))
-        return replace(self, whole=whole, training=training, final=final)
+        """Return None: the noise is told beside all effects and terms already, at least half the stated one."""
+        return None
 
     def propose(self, models: Sequence[SensorModel]) -> tuple[Proposal, ...]:
         """Rank programmes of grasps by how far the models differ on them."""
