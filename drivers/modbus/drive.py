@@ -291,10 +291,15 @@ class DriveUnit(LineUnit):
         self._seldom_ns = 0
 
     def _read_seldom(self, values: Values, now_ns: int) -> Generator[Any, Any, None]:
-        """Read the alarm when the drive says fault, and the rest once a second."""
+        """Read the alarm when the drive says fault, and the rest once a second.
+
+        Without an alarm the drive is asked once more: it may have been reset between the two answers.
+        """
         if self._rmap.alarms and self._bit(values, "fault"):
             alarm = yield from self._mapped.read(self._alarm_plan)
             self._alarm = int(alarm[self._rmap.alarms.signal])
+            if not self._alarm:
+                values |= yield from self._mapped.read(self._plans["always"])
         else:
             self._alarm = 0
         if now_ns >= self._seldom_ns and self._plans["seldom"]:

@@ -226,6 +226,23 @@ def test_an_alarm_in_motion_is_told_by_name_and_reset(make: Callable[..., Rig]) 
     assert rig.position == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.parametrize("leaves_code", [False, True])
+def test_an_alarm_that_ends_between_two_answers_is_none(monkeypatch: pytest.MonkeyPatch, *, leaves_code: bool) -> None:
+    """The status is read first, then the code of the alarm that it tells of."""
+    rig = leadshine_rig()
+    drive, read = rig.drive, rig.drive.read
+
+    def ends(function: int, address: int, count: int) -> Any:
+        if address <= 0x2203 < address + count and not leaves_code:
+            drive.alarm = 0
+        return read(function, address, count)
+
+    monkeypatch.setattr(drive, "read", ends)
+    drive.raise_alarm(0x40)
+    rig.go(0.5)
+    assert bool(rig.status & AxisStatus.FAULT) is leaves_code
+
+
 def test_an_alarm_that_only_a_power_cycle_clears_is_not_reset() -> None:
     rig = az_rig()
     rig.drive.raise_alarm(0x41)
