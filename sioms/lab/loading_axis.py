@@ -24,6 +24,8 @@ POLL_S = 2e-3
 MOVE_S = 10.0  # longest move
 #: The surface is felt for at one speed [m/s], the way in at another; a force is that of so many samples.
 FEEL_M_S, LEARN_M_S, NEAR = 5e-3, 1e-3, 8
+#: On the way the axis is sent no further ahead than it goes in so long [s]: it rests when this program does not look.
+AHEAD_S = 0.04
 FELT = 0.1  # of the largest force: the surface has been found
 LEARNT, OVER = 1.08, 1.3  # of the largest force: the way in is known up to there; pressing is stopped
 AGE_S = 0.5  # a force that is older is not known
@@ -180,26 +182,37 @@ class LoadingAxis:
     def _feel(self, speed: float, until_n: float) -> tuple[Floats, Floats]:
         """Move in until a force is felt; return positions and forces on the way.
 
+        The axis is sent on while the force is looked at, at each look by what it has gone since the last one: however
+        late this program gets its turn, it presses no deeper than twice AHEAD_S allows.
+
         Raises:
             ExperimentStopped: the axis came to its end before.
         """
         channel = self.axis.info.channels[0]
-        end, limits = channel.maximum, channel.limits
-        last, force_last = self.axis.read().number, self.force.read().number
+        end, acceleration = channel.maximum, channel.limits["acceleration"]
+        ahead = speed * AHEAD_S + speed**2 / (2.0 * acceleration)
+        begin, looked_s = self.axis.read(), time.monotonic()
+        last, force_last = begin.number, self.force.read().number
         seen: list[Any] = []
         forces: list[Any] = []
+        sent, wanted, taken = -math.inf, float(begin.position[0]) + ahead, 0
         with self._stopped_by_errors(self.axis):
-            taken = self.axis.command(
-                position=end, max_velocity=speed, max_acceleration=limits["acceleration"], replace=True
-            )
             while True:
+                if sent < end and (wanted - sent > 0.5 * ahead or wanted >= end):
+                    sent = min(end, wanted)
+                    taken = self.axis.command(
+                        position=sent, max_velocity=speed, max_acceleration=acceleration, replace=True
+                    )
                 time.sleep(POLL_S)
+                now_s = time.monotonic()
+                wanted += min(speed * (now_s - looked_s), ahead)
+                looked_s = now_s
                 seen += self.axis.history(seen[-1].number if seen else last)
                 forces += self.force.history(forces[-1].number if forces else force_last)
                 self.check()
                 if len(forces) >= NEAR and self.net(forces[-NEAR:]) > until_n:
                     break
-                if seen and seen[-1].tick > taken and not seen[-1].in_motion[0]:
+                if seen and sent == end and seen[-1].tick > taken and not seen[-1].in_motion[0]:
                     raise ExperimentStopped(
                         f"feel for a surface with {self.axis.name}: no {until_n:.3g} N on {self.force.name} up to "
                         f"{end:.4g} m; check the force sensor, the place and what is to be pressed"

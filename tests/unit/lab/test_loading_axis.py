@@ -11,7 +11,9 @@ from typing import Any
 import pytest
 from tool_rig import snapshot
 
+from sioms.lab import loading_axis
 from sioms.lab.loading_axis import LoadingAxis
+from sioms.lab.stopping import ExperimentStopped
 from sioms.protocol.flags import AnalogStatus, NodeClass
 
 RATE_HZ = 200.0
@@ -99,3 +101,67 @@ def test_a_tare_takes_nothing_that_was_felt_before_it_and_comes_late() -> None:
     wall.axis.read = lambda: _stamped(snapshot(NodeClass.AXIS, 1), 1)
     loading.tare()
     assert loading.tare_n == 1.0
+
+
+class Slow:
+    """An axis that presses on a spring, and a program that gets no turn for 0.4 s now and then, in their own time."""
+
+    name = "press"
+    surface_m, stiffness = 2e-3, 2000.0
+
+    def __init__(self) -> None:
+        self.now_ns, self.turns = 10**9, 0
+        self.place = self.target = self.deepest = 0.0
+        self.velocity = 0.0
+        self.commands = 0
+        info = SimpleNamespace(channels=[SimpleNamespace(maximum=0.02, limits={"velocity": 0.1, "acceleration": 1.0})])
+        self.axis: Any = SimpleNamespace(
+            name="press", info=info, keepalive=lambda: None, command=self.command, stop=self.stop,
+            read=lambda: self.snapshot(NodeClass.AXIS), history=lambda after: [self.snapshot(NodeClass.AXIS)],
+        )  # fmt: skip
+        self.force: Any = SimpleNamespace(
+            name="cell", read=lambda: self.snapshot(NodeClass.ANALOG),
+            history=lambda after: [self.snapshot(NodeClass.ANALOG)],
+        )  # fmt: skip
+
+    def sleep(self, wait_s: float) -> None:
+        self.turns += 1
+        self.pass_by(wait_s + 0.4 * (self.turns % 25 == 0))
+
+    def pass_by(self, time_s: float) -> None:
+        self.now_ns += round(time_s * 1e9)
+        self.place = min(self.target, self.place + self.velocity * time_s)
+        self.deepest = max(self.deepest, self.place)
+
+    def command(self, **fields: Any) -> int:
+        self.target, self.velocity = fields["position"], fields["max_velocity"]
+        self.commands += 1
+        return -1
+
+    def stop(self) -> None:
+        self.target = self.place
+
+    def snapshot(self, node_class: NodeClass) -> Any:
+        self.pass_by(0.0)
+        if node_class is NodeClass.AXIS:
+            given: dict[str, Any] = {"position": [self.place], "in_motion": [int(self.place < self.target)]}
+        else:
+            given = {"data": [max(0.0, self.place - self.surface_m) * self.stiffness]}
+        return _stamped(snapshot(node_class, 1, **given), self.now_ns)
+
+
+def test_a_program_that_gets_no_turn_presses_no_deeper(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = Slow()
+    clock = SimpleNamespace(sleep=slow.sleep, monotonic=lambda: slow.now_ns * 1e-9, monotonic_ns=lambda: slow.now_ns)
+    monkeypatch.setattr(loading_axis, "time", clock)
+    loading = LoadingAxis(slow.axis, slow.force, 3.0, 1e-3)
+    loading.tare_n = 0.0
+    way, force = loading._feel(loading_axis.FEEL_M_S, 0.3)
+    assert force[-1] > 0.3 and way[-1] == pytest.approx(slow.surface_m + force[-1] / slow.stiffness, abs=1e-4)
+    most_m = 2 * loading_axis.FEEL_M_S * loading_axis.AHEAD_S
+    assert slow.deepest <= slow.surface_m + 0.3 / slow.stiffness + most_m
+    slow.target = slow.place = slow.stiffness = 0.0
+    slow.commands = 0
+    with pytest.raises(ExperimentStopped, match=r"no 0\.3 N on cell up to 0\.02 m"):
+        loading._feel(loading_axis.FEEL_M_S, 0.3)
+    assert slow.commands < 0.02 / (0.5 * loading_axis.FEEL_M_S * loading_axis.AHEAD_S) + 2
