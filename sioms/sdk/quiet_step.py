@@ -340,9 +340,15 @@ def look_at_rest(q: Quiet, now_ns: int) -> int:
 
 @step
 def announce(q: Quiet) -> int:
-    """Do the slack of a tick before it, and have the other timer begin it; return what has become of this one."""
+    """Do the slack of a tick before it, and have the other timer begin it; return what has become of this one.
+
+    A tick that was announced and has yet to come is waited for, not put off: it comes before the next announcement.
+    """
     due_ns = q.scheduled_ns + (q.announced + q.expired) * q.period_ns
     began_ns = clock_ns()
+    if q.announced and due_ns - q.expired * q.period_ns > began_ns:
+        q.expired = 0
+        return DONE
     if q.desk.kept:
         return LEFT
     if q.slack(q.device, began_ns, due_ns, 0):

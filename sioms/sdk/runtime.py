@@ -437,9 +437,11 @@ class Runtime:
         if not expired:
             return
         if self._lead_ns and self._idling.periods == 1 and isinstance(self.engine, TickEngine):
+            began_ns = time.monotonic_ns()
+            if self._announced and self._scheduled_ns + self._announced * self.period_ns > began_ns:
+                return  # see quiet_step.announce
             self._announced += expired
             due_ns = self._scheduled_ns + self._announced * self.period_ns
-            began_ns = time.monotonic_ns()
             self.engine.slack(began_ns, due_ns)
             self._slack_ns = time.monotonic_ns() - began_ns
             self.set_line_timer(due_ns)
@@ -497,7 +499,7 @@ class Runtime:
     def _be_idle(self, now_ns: int) -> None:
         if self._idling.rest(now_ns):
             idle_ns = self._idling.periods * self.period_ns
-            self._timer.set(self._scheduled_ns + idle_ns, idle_ns)
+            self._beat(self._scheduled_ns + idle_ns, idle_ns)
 
     def _wake(self) -> None:
         """Tick at the full rate again, beginning now: something has happened, or is going to."""
@@ -505,9 +507,16 @@ class Runtime:
         if not self._idling.wake(now_ns):
             return
         self._scheduled_ns += (now_ns - self._scheduled_ns) // self.period_ns * self.period_ns
-        self._timer.set(self._scheduled_ns + self.period_ns - self._lead_ns, self.period_ns)
+        self._beat(self._scheduled_ns + self.period_ns - self._lead_ns, self.period_ns)
         if not self._is_ticking:
             self.set_line_timer(now_ns)
+
+    def _beat(self, first_ns: int, period_ns: int) -> None:
+        """Have the timer announce ticks from an instant on. What it has announced before, and has yet to come, is of
+        another beat: counted from the new one it would lie ahead for ever.
+        """
+        self._timer.set(first_ns, period_ns)
+        self._expired = self._announced = 0
 
     def _spare_until(self, ticked_ns: int) -> int:
         """Return until when pieces of clients' work may begin after a tick [ns].

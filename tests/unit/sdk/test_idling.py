@@ -110,6 +110,30 @@ def test_an_order_a_stop_and_an_input_wake_it() -> None:
         world.close()
 
 
+@pytest.mark.parametrize("woken", [False, True])
+def test_a_tick_that_was_announced_before_another_beat_is_none_of_it(*, woken: bool) -> None:
+    """A device of several in a process ticks on while it waits for its turn: it may be found at rest, and woken, with
+    its next tick announced. Counted from the new beat that tick lay ahead for ever.
+    """
+    made: list[World] = []
+    with own_time(made):
+        world = rested(SimAxes, AXES, made, used=False, ticks=900)
+        runtime = world.runtime
+        assert periods(world) == 1
+        CLOCK.now_ns += 10**9
+        runtime._announced, runtime._expired = 1, 1
+        runtime._be_idle(CLOCK.now_ns)
+        assert periods(world) == 40
+        if woken:
+            runtime._wake()
+        assert (runtime._announced, runtime._expired) == (0, 0)
+        due_ns, last = runtime._scheduled_ns + periods(world) * PERIOD_NS, runtime.tick
+        for _ in range(5 * periods(world)):
+            world.tick()
+        assert runtime.tick > last and runtime._scheduled_ns >= due_ns
+        world.close()
+
+
 def test_what_moves_by_itself_is_not_idle() -> None:
     made: list[World] = []
     with own_time(made):

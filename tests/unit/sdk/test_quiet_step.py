@@ -303,6 +303,20 @@ def test_a_stop_has_a_tick_soon_but_not_sooner_than_a_quarter_of_a_period(make):
     assert len(device.ticks) == 1 and device.quiet.scheduled_ns == last_ns and device.quiet.ticked_ns > last_ns
 
 
+def test_a_tick_that_is_announced_is_never_put_off(make):
+    """A device whose count of ticks ran ahead put its tick off at every period, and never ticked again."""
+    device = make(lead_ns=200_000, expired=0, scheduled_ns=time.monotonic_ns() + 2 * PERIOD_NS, announced=1)
+    device.line.set(due_ns := device.quiet.scheduled_ns + PERIOD_NS)
+    for _ in range(3):
+        os.eventfd_write(device.timer, 1)
+        assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
+    assert (device.slacks, device.quiet.announced, device.quiet.expired) == (0, 1, 0)
+    is_readable(device.line.fd, 10.0)
+    assert time.monotonic_ns() >= due_ns
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == DONE
+    assert len(device.ticks) == 1 and device.quiet.announced == 0
+
+
 def test_a_slack_before_the_tick_announces_it(make):
     device = make(lead_ns=200_000, expired=0, scheduled_ns=time.monotonic_ns() - 3 * PERIOD_NS)
     os.eventfd_write(device.timer, 1)
