@@ -219,11 +219,24 @@ def begin_to_brake(q: Quiet, now_ns: int, latches: int) -> int:
     q.brakes = 1
     owe(q)
     if q.lead_ns and q.periods == 1 and not q.announced:
-        early_ns = max(now_ns, q.ticked_ns + int(q.period_ns / 4))
-        if early_ns <= q.scheduled_ns + int(q.period_ns / 2):
-            q.early_ns = early_ns
-            set_timer(q.line_timer, early_ns)
+        tick_soon(q, now_ns)
     return 0
+
+
+@step
+def tick_soon(q: Quiet, now_ns: int) -> int:
+    """Have a tick off the grid, unless the next one comes as soon: ticks are a quarter of a period apart at least."""
+    early_ns = max(now_ns, q.ticked_ns + int(q.period_ns / 4))
+    if early_ns <= last_early_ns(q):
+        q.early_ns = early_ns
+        set_timer(q.line_timer, early_ns)
+    return 0
+
+
+@step
+def last_early_ns(q: Quiet) -> int:
+    """Return when a tick off the grid may be at the latest [ns]."""
+    return q.scheduled_ns + q.period_ns - int(q.period_ns / 4)
 
 
 @step
@@ -280,8 +293,14 @@ def may_tick(q: Quiet, now_ns: int) -> int:
 
 @step
 def early_tick(q: Quiet) -> int:
-    """Do a tick off the grid, after a stop; return what has become of what announced it."""
+    """Do a tick off the grid, after a stop; return what has become of what announced it.
+
+    One that comes too late is left out: the next one of the grid, which may be due already, is for an instant before.
+    """
     now_ns = clock_ns()
+    if now_ns > last_early_ns(q):
+        q.early_ns = 0
+        return DONE
     if q.desk.kept or not may_tick(q, now_ns):
         return LEFT
     if q.tick(q.device, now_ns, q.heeded_ns if q.heeded_ns else now_ns, q.number + 1):
@@ -368,10 +387,12 @@ def heed_timer(q: Quiet, fd: int) -> int:
         if q.expired == 0:
             return DONE
         return announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
-    if fd == q.line_timer and (q.announced or q.early_ns):
+    if fd == q.line_timer:
         if not expirations(q.line_timer):
             return DONE
-        return one_tick(q) if q.announced else early_tick(q)
+        if q.announced:
+            return one_tick(q)
+        return early_tick(q) if q.early_ns else DONE  # what it was set for has come with another tick
     return LEFT
 
 
@@ -430,8 +451,12 @@ def wait_turn(q: Quiet) -> int:
         return q.slackens
     if q.expired:
         found = announce(q) if q.lead_ns and q.periods == 1 else one_tick(q)
+    elif not q.announced:
+        found = early_tick(q)
+    elif q.scheduled_ns + q.announced * q.period_ns <= clock_ns():
+        found = one_tick(q)
     else:
-        found = one_tick(q) if q.announced else early_tick(q)
+        found = DONE  # it has been announced together with the one after it since it was left
     if found == LEFT:
         return 1
     q.left = 0

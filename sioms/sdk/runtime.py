@@ -115,6 +115,7 @@ class Runtime:
         self._ending_ns = 0
         self._moved_ns = 0
         self._is_ticking = False
+        """Whether there is yet to be a tick of what is heeded now."""
         self._ticked_ns = 0
         self._brakes = False
         """Whether steps have begun the stop that is being heeded."""
@@ -257,7 +258,7 @@ class Runtime:
         self.watch(self._timer.fd, self._on_timer)
         self.watch(self._line_timer.fd, self._on_line_timer)
         phase_ns = int(self._phase * self.period_ns)
-        self._scheduled_ns = time.monotonic_ns() // self.period_ns * self.period_ns + phase_ns
+        self._scheduled_ns = (time.monotonic_ns() - phase_ns) // self.period_ns * self.period_ns + phase_ns
         self._timer.set(self._scheduled_ns + 2 * self.period_ns - self._lead_ns, self.period_ns)
         self.turns.gives_way = os.sched_getscheduler(0) == os.SCHED_FIFO
         self.looked_ns = time.monotonic_ns()
@@ -359,6 +360,7 @@ class Runtime:
             kept.let_go()
         for timer in (self._timer, self._line_timer):
             timer.close()
+        self.stops.release()
         self._epoll.close()
         self._control.close()
 
@@ -412,25 +414,38 @@ class Runtime:
         self._spare_until_ns = self._spare_until(self._scheduled_ns)
 
     def tick_early(self) -> None:
-        """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn.
+        """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn."""
+        if not self._lead_ns or self._is_ticking or self._announced:  # the next one of frequent ticks comes as soon
+            return
+        if not self._brakes:  # by steps, which have seen to that
+            self._tick_soon()
+
+    def _tick_soon(self) -> None:
+        """Have a tick off the grid, unless the next one comes as soon; see ``quiet_step.tick_soon``.
 
         A loop that is closed here measures velocities over the time between two ticks; a quarter of the usual one is
         the least that it gets.
         """
-        if not self._lead_ns or self._is_ticking or self._announced:  # the next one of frequent ticks comes as soon
-            return
-        if self._brakes:  # by steps, which have seen to that
-            return
-        next_ns = self._scheduled_ns + self.period_ns
         early_ns = max(time.monotonic_ns(), self._ticked_ns + self.period_ns // 4)
-        if next_ns - early_ns > self.period_ns // 4:
+        if early_ns <= self._last_early_ns:
             self.set_line_timer(early_ns)
+
+    @property
+    def _last_early_ns(self) -> int:
+        """When a tick off the grid may be at the latest [ns]."""
+        return self._scheduled_ns + self.period_ns - self.period_ns // 4
 
     def _early_tick(self) -> None:
         now_ns = time.monotonic_ns()
-        self.tick += 1
-        self._look_around(now_ns)
-        self.after_publication(self._tick_and_publish(now_ns), self.blocks if self.engine.publishes else ())
+        if now_ns > self._last_early_ns:
+            return  # see quiet_step.early_tick
+        self._is_ticking = True
+        try:
+            self.tick += 1
+            self._look_around(now_ns)
+            self.after_publication(self._tick_and_publish(now_ns), self.blocks if self.engine.publishes else ())
+        finally:
+            self._is_ticking = False
 
     def _on_timer(self) -> None:
         expired, self._expired = self._expired or self._timer.expirations(), 0
@@ -509,7 +524,7 @@ class Runtime:
         self._scheduled_ns += (now_ns - self._scheduled_ns) // self.period_ns * self.period_ns
         self._beat(self._scheduled_ns + self.period_ns - self._lead_ns, self.period_ns)
         if not self._is_ticking:
-            self.set_line_timer(now_ns)
+            self._tick_soon()
 
     def _beat(self, first_ns: int, period_ns: int) -> None:
         """Have the timer announce ticks from an instant on. What it has announced before, and has yet to come, is of
@@ -546,6 +561,7 @@ class Runtime:
         engine = self.engine
         self._ticked_ns = scheduled_ns
         engine.tick(scheduled_ns)
+        self._is_ticking = False  # what is stopped by what has been read waits for another tick
         ticked_ns = time.monotonic_ns()
         self.pages.alive(ticked_ns)
         if isinstance(engine, TickEngine) and engine.publishes:
@@ -555,6 +571,8 @@ class Runtime:
 
     def _on_line_timer(self) -> None:
         self._line_timer.expirations()
+        if self._line_due_ns is None or self._line_due_ns > time.monotonic_ns():
+            return  # it has been set anew since it expired
         self._line_due_ns = None
         if self._announced:
             self._tick_on_time(self._announced)

@@ -414,6 +414,10 @@ class Stops:
                 if channel < block.n:
                     self.stop_node(block, [channel], bit if block.spec.channels[channel].width else -1, source)
 
+    def release(self) -> None:
+        """Close the stop-request file, when the process goes on without this device."""
+        self._request.close()
+
     def _note(self, entry: dict[str, Any]) -> None:
         try:
             self._journal.append(entry, time.time())

@@ -293,7 +293,7 @@ def test_a_stop_has_a_tick_soon_but_not_sooner_than_a_quarter_of_a_period(make):
     assert begin_stop(device.quiet, last_ns + 1000) == 0
     assert device.quiet.early_ns == last_ns + period_ns // 4
     device.quiet.stopped = device.quiet.early_ns = 0
-    assert begin_stop(device.quiet, last_ns + 6 * period_ns // 10) == 0
+    assert begin_stop(device.quiet, last_ns + 8 * period_ns // 10) == 0
     assert not device.quiet.early_ns, "the next one comes as soon"
     device.quiet.early_ns = 1
     quiet_step.set_timer(device.line.fd, 1)
