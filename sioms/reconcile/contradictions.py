@@ -18,7 +18,7 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.thresholds import JUMP_COUNTS, JUMP_TIMES, LAWLESS, NOISY, TWICE
+from sioms.reconcile.thresholds import JUMP_COUNTS, JUMP_TIMES, LAWLESS, NOISY, SMOOTHER, TWICE
 
 #: Samples (one row late is a way of logging, ``sampling``) that a column is looked for ahead or behind of the others.
 SHIFTS = (*range(2, 31), 40, 50, 60, 80, 100)
@@ -72,6 +72,7 @@ def check_one(record: Record, r: Record, model: AxisModel) -> None:
     where = f"read record {record.name}"
     _check_rows(r, where)
     _check_smooth(r, model, where)
+    _check_order(r, model, where)
     _check_jumps(r, model, where)
     _check_law(r, model, where)
 
@@ -94,13 +95,40 @@ def _check_smooth(r: Record, model: AxisModel, where: str) -> None:
     for name, a in (("position", r.position), ("command", r.command)):
         if a is None or np.ptp(a) < 8.0 * model.resolution:
             continue
-        noise = float(np.sqrt(np.mean(np.diff(a, 3) ** 2) / 20.0))
+        noise = _roughness(a)
         if noise > NOISY * float(np.std(a)):
             raise BadInputError(
                 f"{where}: {name} changes from row to row as much as it does altogether "
                 f"({100 * noise / float(np.std(a)):.0f} %); "
                 "it is noise, or the rows are in no order of time"
             )
+
+
+def _check_order(r: Record, model: AxisModel, where: str) -> None:
+    """Find neighbours that have changed places: a motion is rougher with them exchanged, not smoother."""
+    a = r.position
+    if np.ptp(a) < 8.0 * model.resolution:
+        return
+    given = _roughness(a)
+    for first in (0, 1):
+        if _roughness(_exchanged(a, first)) < SMOOTHER * given:
+            raise BadInputError(
+                f"{where}: the position is smoother with every two neighbouring rows exchanged; the rows are in no "
+                "order of time"
+            )
+
+
+def _roughness(a: Array) -> float:
+    """Return the size of the third differences, of which noise and a wrong order make much and a motion little."""
+    return float(np.sqrt(np.mean(np.diff(a, 3) ** 2) / 20.0))
+
+
+def _exchanged(a: Array, first: int) -> Array:
+    """Exchange the rows of every pair, beginning with a row."""
+    out = a.copy()
+    n = (len(a) - first) // 2 * 2
+    out[first : first + n] = a[first : first + n].reshape(-1, 2)[:, ::-1].ravel()
+    return out
 
 
 def _check_jumps(r: Record, model: AxisModel, where: str) -> None:
@@ -163,7 +191,10 @@ def _otherwise(r: Record, command: Array) -> Iterable[tuple[str, Record]]:
             part = slice(max(k, 0), len(r) + min(k, 0))
             shifted = slice(max(-k, 0), len(r) + min(-k, 0))
             moved = replace(r.only(part), force=r.force[shifted], feedforward=_cut(r.feedforward, shifted))
-            yield f"the force is taken {n} rows {'earlier' if k > 0 else 'later'}", moved
+            when = f"{n} rows {'earlier' if k > 0 else 'later'}"
+            yield f"the force is taken {when}", moved
+            yield f"the command is taken {when}", replace(r.only(part), command=command[shifted])
+            yield f"the position is taken {when}", replace(r.only(part), position=r.position[shifted])
 
 
 def _cut(a: Array | None, part: slice) -> Array | None:

@@ -45,6 +45,10 @@ axes: 0.07 at most; doubled rows 1 (0562)."""
 NOISY = 0.2
 """A position whose third differences hold this share of its spread is noise, or in no order of time. Forty axes: 0.011
 at most; white noise 1 (0562)."""
+SMOOTHER = 0.7
+"""Neighbouring rows have changed places where the third differences of the position are less than this share with every
+two of them exchanged. 336 records of drawn and stored axes: 1.003 at least, of an encoder that hardly counts, else 1.5;
+with rows exchanged 0.01 at the median and 0.64 at most, but for two of that encoder (0890)."""
 JUMP_TIMES, JUMP_COUNTS = 20.0, 8.0
 """A position leaps where its bend is so many times what it is in all but a fiftieth of the samples, and so many
 counts. Forty axes: 4.2 times at most (0562)."""

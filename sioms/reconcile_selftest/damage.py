@@ -1,4 +1,4 @@
-"""A hundred ways in which records, their description or their model can be damaged or of something else.
+"""More than a hundred ways in which records, their description or their model can be damaged or of something else.
 
 Each takes what the solver may see of one axis, and of another one, and returns what it is given instead. None of them
 leaves anything that could be named: an answer is an error, or a refusal.
@@ -48,11 +48,11 @@ class Public:
 Damage = Callable[[Public, Public, np.random.Generator], Public]
 
 
-def _column(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Damage:
+def column(name: str, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Damage:
     return lambda p, other, rng: p.each(lambda r: {**r, name: change(r[name])})
 
 
-def _columns(names: tuple[str, ...], change: Callable[[NDArray[Any]], NDArray[Any]]) -> Damage:
+def columns(names: tuple[str, ...], change: Callable[[NDArray[Any]], NDArray[Any]]) -> Damage:
     return lambda p, other, rng: p.each(lambda r: {**r, **{n: change(r[n]) for n in names}})
 
 
@@ -92,7 +92,7 @@ def _from_other(*names: str) -> Damage:
     return damage
 
 
-def _rows(chosen: Callable[[int, np.random.Generator], NDArray[Any]], timed: bool = False, one: bool = False) -> Damage:
+def rows(chosen: Callable[[int, np.random.Generator], NDArray[Any]], timed: bool = False, one: bool = False) -> Damage:
     def damage(p: Public, other: Public, rng: np.random.Generator) -> Public:
         changed = (p if timed else p.without_time()).rows(lambda n: chosen(n, rng))
         return replace(changed, runs=(*p.runs[:-1], changed.runs[-1])) if one else changed
@@ -185,34 +185,34 @@ MEASURED = ("counts", "command", "force", "force_measured")
 LATER: Callable[[int], Callable[[NDArray[Any]], NDArray[Any]]] = lambda n: lambda a: np.roll(a, n)  # noqa: E731
 KINDS: Mapping[str, Damage] = {
     # rows, where no time tells
-    "every second row lost": _rows(lambda n, rng: np.arange(0, n, 2)),
-    "every second row lost in one record": _rows(lambda n, rng: np.arange(0, n, 2), one=True),
-    "two rows of three lost": _rows(lambda n, rng: np.arange(0, n, 3)),
-    "nine rows of ten lost": _rows(lambda n, rng: np.arange(0, n, 10)),
-    "rows doubled": _rows(lambda n, rng: np.repeat(np.arange(n), 2)),
-    "rows tripled": _rows(lambda n, rng: np.repeat(np.arange(n), 3)),
-    "a tenth of the rows lost": _rows(lambda n, rng: np.flatnonzero(rng.random(n) > 0.1)),
-    "half of the rows lost": _rows(lambda n, rng: np.flatnonzero(rng.random(n) > 0.5)),
-    "a tenth of the rows doubled": _rows(lambda n, rng: np.repeat(np.arange(n), 1 + (rng.random(n) < 0.1))),
-    "a part cut out": _rows(lambda n, rng: np.r_[0 : n // 3, n // 2 : n]),
-    "a part twice": _rows(lambda n, rng: np.r_[0 : n // 2, n // 3 : n]),
-    "two parts exchanged": _rows(_swapped_blocks),
-    "rows shuffled": _rows(lambda n, rng: rng.permutation(n)),
-    "rows backwards": _rows(lambda n, rng: np.arange(n)[::-1]),
+    "every second row lost": rows(lambda n, rng: np.arange(0, n, 2)),
+    "every second row lost in one record": rows(lambda n, rng: np.arange(0, n, 2), one=True),
+    "two rows of three lost": rows(lambda n, rng: np.arange(0, n, 3)),
+    "nine rows of ten lost": rows(lambda n, rng: np.arange(0, n, 10)),
+    "rows doubled": rows(lambda n, rng: np.repeat(np.arange(n), 2)),
+    "rows tripled": rows(lambda n, rng: np.repeat(np.arange(n), 3)),
+    "a tenth of the rows lost": rows(lambda n, rng: np.flatnonzero(rng.random(n) > 0.1)),
+    "half of the rows lost": rows(lambda n, rng: np.flatnonzero(rng.random(n) > 0.5)),
+    "a tenth of the rows doubled": rows(lambda n, rng: np.repeat(np.arange(n), 1 + (rng.random(n) < 0.1))),
+    "a part cut out": rows(lambda n, rng: np.r_[0 : n // 3, n // 2 : n]),
+    "a part twice": rows(lambda n, rng: np.r_[0 : n // 2, n // 3 : n]),
+    "two parts exchanged": rows(_swapped_blocks),
+    "rows shuffled": rows(lambda n, rng: rng.permutation(n)),
+    "rows backwards": rows(lambda n, rng: np.arange(n)[::-1]),
     "rows in order of position": _ordered("counts"),
     "rows in order of force": _ordered("force"),
-    "neighbours exchanged": _rows(lambda n, rng: np.arange(n - n % 2).reshape(-1, 2)[:, ::-1].ravel()),
+    "neighbours exchanged": rows(lambda n, rng: np.arange(n - n % 2).reshape(-1, 2)[:, ::-1].ravel()),
     # time
-    "rows shuffled with their time": _rows(lambda n, rng: rng.permutation(n), timed=True),
-    "every second row lost with its time": _rows(lambda n, rng: np.arange(0, n, 2), timed=True),
-    "time stands still": _column("time", np.zeros_like),
-    "time runs backwards": _column("time", lambda t: t[::-1]),
-    "time in milliseconds": _column("time", lambda t: 1e3 * t),
-    "time in minutes": _column("time", lambda t: t / 60.0),
-    "time half as fast": _column("time", lambda t: 2.0 * t),
-    "time a tenth too fast": _column("time", lambda t: t / 1.1),
-    "time without numbers": _column("time", lambda t: np.full_like(t, np.nan)),
-    "time with leaps": _column("time", lambda t: t + np.floor(np.arange(len(t)) / 50)),
+    "rows shuffled with their time": rows(lambda n, rng: rng.permutation(n), timed=True),
+    "every second row lost with its time": rows(lambda n, rng: np.arange(0, n, 2), timed=True),
+    "time stands still": column("time", np.zeros_like),
+    "time runs backwards": column("time", lambda t: t[::-1]),
+    "time in milliseconds": column("time", lambda t: 1e3 * t),
+    "time in minutes": column("time", lambda t: t / 60.0),
+    "time half as fast": column("time", lambda t: 2.0 * t),
+    "time a tenth too fast": column("time", lambda t: t / 1.1),
+    "time without numbers": column("time", lambda t: np.full_like(t, np.nan)),
+    "time with leaps": column("time", lambda t: t + np.floor(np.arange(len(t)) / 50)),
     "time at random": lambda p, other, rng: p.each(lambda r: {**r, "time": np.sort(rng.random(len(r["time"])))}),
     # columns
     "position and command exchanged": _exchanged("counts", "command"),
@@ -230,30 +230,30 @@ KINDS: Mapping[str, Damage] = {
     "command of another axis": _from_other("command"),
     "all but the command of another axis": _from_other("counts", "force", "force_measured"),
     "two records of another axis": _mixed_records,
-    "force five rows late": _column("force", LATER(5)),
-    "force fifty rows late": _column("force", LATER(50)),
-    "force five rows early": _column("force", LATER(-5)),
-    "position twenty rows late": _column("counts", LATER(20)),
-    "command thirty rows late": _column("command", LATER(30)),
-    "measured force sixty rows late": _column("force_measured", LATER(60)),
+    "force five rows late": column("force", LATER(5)),
+    "force fifty rows late": column("force", LATER(50)),
+    "force five rows early": column("force", LATER(-5)),
+    "position twenty rows late": column("counts", LATER(20)),
+    "command thirty rows late": column("command", LATER(30)),
+    "measured force sixty rows late": column("force_measured", LATER(60)),
     # signs and units
-    "force turned round": _columns(("force", "force_measured"), np.negative),
-    "position turned round": _column("counts", np.negative),
-    "command turned round": _column("command", np.negative),
-    "measured force turned round": _column("force_measured", np.negative),
-    "force without its sign": _columns(("force", "force_measured"), np.abs),
-    "position without its sign": _column("counts", np.abs),
-    "force in thousandths": _columns(("force", "force_measured"), lambda a: 1e3 * a),
-    "force in thousands": _columns(("force", "force_measured"), lambda a: 1e-3 * a),
-    "force alone in thousandths": _column("force", lambda a: 1e3 * a),
-    "position in thousandths": _columns(("counts", "command"), lambda a: 1000 * a),
-    "command in thousandths": _column("command", lambda a: 1e3 * a),
-    "command in thousands": _column("command", lambda a: 1e-3 * a),
-    "command in inches": _column("command", lambda a: a / 25.4),
-    "measured force in thousandths": _column("force_measured", lambda a: 1e3 * a),
-    "measured force in amperes": _column("force_measured", lambda a: 0.21 * a),
-    "force in kilograms": _columns(("force", "force_measured"), lambda a: a / 9.80665),
-    "angle in degrees": _columns(("counts", "command"), lambda a: 57.29578 * a),
+    "force turned round": columns(("force", "force_measured"), np.negative),
+    "position turned round": column("counts", np.negative),
+    "command turned round": column("command", np.negative),
+    "measured force turned round": column("force_measured", np.negative),
+    "force without its sign": columns(("force", "force_measured"), np.abs),
+    "position without its sign": column("counts", np.abs),
+    "force in thousandths": columns(("force", "force_measured"), lambda a: 1e3 * a),
+    "force in thousands": columns(("force", "force_measured"), lambda a: 1e-3 * a),
+    "force alone in thousandths": column("force", lambda a: 1e3 * a),
+    "position in thousandths": columns(("counts", "command"), lambda a: 1000 * a),
+    "command in thousandths": column("command", lambda a: 1e3 * a),
+    "command in thousands": column("command", lambda a: 1e-3 * a),
+    "command in inches": column("command", lambda a: a / 25.4),
+    "measured force in thousandths": column("force_measured", lambda a: 1e3 * a),
+    "measured force in amperes": column("force_measured", lambda a: 0.21 * a),
+    "force in kilograms": columns(("force", "force_measured"), lambda a: a / 9.80665),
+    "angle in degrees": columns(("counts", "command"), lambda a: 57.29578 * a),
     "resolution a thousand times": _axis(resolution=1e3),
     "resolution a thousandth": _axis(resolution=1e-3),
     # the model
@@ -276,15 +276,15 @@ KINDS: Mapping[str, Damage] = {
     "white noise in measured force": _noise(("force_measured",)),
     "position drifts at random": _walk,
     "position at rest": _resting,
-    "force constant": _column("force", np.ones_like),
-    "force without numbers": _column("force", lambda a: np.full_like(a, np.nan)),
+    "force constant": column("force", np.ones_like),
+    "force without numbers": column("force", lambda a: np.full_like(a, np.nan)),
     "spikes in position": _spikes("counts", 0.5, 30),
     "spikes in force": _spikes("force", 2.0, 200),
-    "position stops half way": _column("counts", _frozen),
-    "force stops half way": _columns(("force", "force_measured"), _frozen),
-    "position cut off": _column("counts", _clipped(0.5)),
-    "force cut off in the record": _columns(("force", "force_measured"), _clipped(0.3)),
-    "position wrapped": _column("counts", _wrapped),
+    "position stops half way": column("counts", _frozen),
+    "force stops half way": columns(("force", "force_measured"), _frozen),
+    "position cut off": column("counts", _clipped(0.5)),
+    "force cut off in the record": columns(("force", "force_measured"), _clipped(0.3)),
+    "position wrapped": column("counts", _wrapped),
     # files
     "NPZ of garbage": _file("run0.npz", lambda rng: rng.bytes(5000)),
     "MAT of garbage": _file("run0.mat", lambda rng: rng.bytes(5000)),

@@ -66,7 +66,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default=0,
         help="additional diagnoses of each with resampled blocks",
     )
-    test.add_argument("--damaged", action="store_true", help="damage the data in a hundred ways; nothing may be named")
+    test.add_argument("--damaged", action="store_true", help="damage the data in many ways; nothing may be named")
     watch.add_parser(kinds)
     effects = kinds.add_parser("effects", help="print the library of effects")
     effects.add_argument("of", nargs="?", choices=("axis", "sensors"), default="axis", help="subject (default axis)")

@@ -22,7 +22,8 @@ import numpy as np
 
 from sioms.reconcile.command.selftest import record
 from sioms.reconcile_selftest.axis import Axis
-from sioms.reconcile_selftest.damage import KINDS, Public
+from sioms.reconcile_selftest.damage import Public
+from sioms.reconcile_selftest.damage_within import EVERY
 from sioms.reconcile_selftest.draw import draw_axis
 
 #: Axes that are damaged in turn, each with another one of its kind; and what they hide.
@@ -79,7 +80,7 @@ def damaged(
     answers: list[Answer] = []
     read = 0
     with tempfile.TemporaryDirectory() as base:
-        for i, (kind, damage) in enumerate(KINDS.items()):
+        for i, (kind, damage) in enumerate(EVERY.items()):
             if only and kind not in only:
                 continue
             one, other = pairs[i % len(pairs)]

@@ -18,7 +18,8 @@ from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile_selftest.damage import KINDS, Public
+from sioms.reconcile_selftest.damage import Public
+from sioms.reconcile_selftest.damage_within import EVERY
 
 AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
 Change = Callable[[Record], Record]
@@ -53,6 +54,19 @@ def noise(r: Record) -> Record:
     return replace(r, **{n: np.std(a) * rng.standard_normal(len(r)) for n, a in r.arrays().items() if n != "index"})
 
 
+def late(a: np.ndarray | None, n: int) -> np.ndarray:
+    """Take every value some rows late; the first stands meanwhile."""
+    assert a is not None
+    return np.concatenate([np.full(n, a[0]), a[:-n]])
+
+
+def exchanged(rows: np.ndarray, first: int) -> np.ndarray:
+    """Exchange every two neighbours, beginning with a row."""
+    n = (len(rows) - first) // 2 * 2
+    pairs = rows[first : first + n].reshape(-1, 2)[:, ::-1].ravel()
+    return np.concatenate([rows[:first], pairs, rows[first + n :]])
+
+
 def test_records_that_agree_with_themselves_pass() -> None:
     prepare(*given(), Options(pictures=False))
 
@@ -66,6 +80,10 @@ def test_records_that_agree_with_themselves_pass() -> None:
         (lambda r: replace(r, position=r.command, command=r.position), "exchanged"),
         (lambda r: replace(r, force=np.roll(r.force, 7)), "7 rows"),
         (lambda r: replace(r, force=np.roll(r.force, 8)), "8 rows"),
+        (lambda r: replace(r, command=late(r.command, 30)), "the command is taken 30 rows later"),
+        (lambda r: replace(r, position=late(r.position, 20)), "the position is taken 20 rows later"),
+        (rows(lambda n: exchanged(np.arange(n), 0)), "exchanged; the rows are in no order of time"),
+        (rows(lambda n: exchanged(np.arange(n), 1)), "exchanged; the rows are in no order of time"),
         (lambda r: replace(r, command=-r.command), "turned round"),
         (lambda r: replace(r, position=r.position % (0.3 * np.ptp(r.position))), "leaps"),
     ],
@@ -158,13 +176,13 @@ def public() -> Public:
     return Public(runs, tuple(COLUMNS), {"axis": axis, "controller": {k: getattr(model.controller, k) for k in keys}})
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", EVERY)
 def test_every_kind_of_damage_makes_something_else(kind: str, tmp_path: Path) -> None:
     """A kind that leaves everything as it was would be right by being wrong."""
     one, other = public(), public()
     other = other.each(lambda r: {k: a[::-1] for k, a in r.items()})
     other = replace(other, model={k: dict.fromkeys(v, 2) for k, v in other.model.items()})
-    changed = KINDS[kind](one, other, np.random.default_rng(1))
+    changed = EVERY[kind](one, other, np.random.default_rng(1))
     for name, p in (("one", one), ("changed", changed)):
         write(p, tmp_path / name)
     files = [{f.name: f.read_bytes() for f in (tmp_path / n).iterdir()} for n in ("one", "changed")]
