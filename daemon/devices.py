@@ -133,6 +133,11 @@ class DriverProcess:
         return self.device.common.process
 
     @property
+    def lives_in(self) -> tuple[str, str]:
+        """The same for all devices of a process, and for no other."""
+        return self.process, "" if self.process else self.name
+
+    @property
     def is_there(self) -> bool:
         """Whether there is a process to send messages to."""
         return self._sock is not None

@@ -51,8 +51,7 @@ class Stops:
         if not known:
             self._cell.log("warning", "emergency stop", source=source)
             latch.name_source(source)  # drivers see the request page before the message that says who
-        for device in self._cell.devices.values():
-            device.tell(driver_verbs.StopChanged())
+        self._wake_drivers()
         self._shared.record.look()
         if not known or not self._shared.record.state.workcell:
             self._note(workcell_entry(source, stop=True, named=True, latched_ns=latch.stopped_ns))
@@ -180,9 +179,17 @@ class Stops:
     def stopped(self, device: DriverProcess, source: str) -> None:
         """Wake the other drivers: one has latched the stop of the workcell."""
         self._cell.log("warning", "emergency stop", source=source, device=device.name)
-        for other in self._cell.devices.values():
-            if other is not device:
-                other.tell(driver_verbs.StopChanged())
+        self._wake_drivers(but=device)
+
+    def _wake_drivers(self, but: DriverProcess | None = None) -> None:
+        """Have processes look at the latch before their next tick, which looks anyway; of several devices in one, one
+        looks for all.
+        """
+        told = set() if but is None else {but.lives_in}
+        for device in self._cell.devices.values():
+            if device.is_there and device.lives_in not in told:
+                told.add(device.lives_in)
+                device.tell(driver_verbs.StopChanged())
 
     def look_at_inputs(self, device: DriverProcess) -> None:
         """Stop the workcell when an input of a device that is to stop it cannot be read: it may be pressed."""

@@ -6,6 +6,7 @@ nothing but note when they tick.
 
 from __future__ import annotations
 
+import gc
 import os
 import socket
 import time
@@ -158,7 +159,7 @@ class Device:
             "stopped": [],
         }  # fmt: skip
         fds = [theirs.detach(), *files]
-        self._kept = [files[0], files[3], files[5]]
+        self._kept = [files[0], *files[3:]]
         """What the runtime has mapped, and does not close: its process would."""
         self.runtime = Runtime(Ticker, "dev", Table(hz), 1, options, fds)
         self.runtime.sees_requests = True
@@ -209,8 +210,9 @@ class Process:
             _drain(device.control)
 
     def serve(self) -> None:
-        """Serve the device whose turn it is."""
-        self.group._serve_next()
+        """Serve the device whose turn it is, unless there is a stop to begin."""
+        if not self.group._look_for_stops():
+            self.group._serve_next()
 
     def serve_all(self) -> None:
         """Serve all whose turn it is."""
@@ -291,3 +293,4 @@ def processes() -> Iterator[Callable[..., Process]]:
         yield make
         while made:
             made.pop().close()
+    gc.collect()  # what the runtimes have mapped

@@ -11,7 +11,7 @@ import time
 
 from .language import Bytes, Context, Integers, record_of
 
-MOST_EVENTS = 64
+MOST_EVENTS = 256
 
 C = """
 static inline int64_t sioms_clock_ns(void)
@@ -23,8 +23,8 @@ static inline int64_t sioms_clock_ns(void)
 
 static inline int64_t sioms_wait_for(int64_t poll, int64_t *ready, int64_t timeout_ms)
 {
-    struct epoll_event events[64];
-    int count = epoll_wait((int)poll, events, 64, (int)timeout_ms);
+    struct epoll_event events[256];
+    int count = epoll_wait((int)poll, events, 256, (int)timeout_ms);
     for (int i = 0; i < count; i++)
         ready[i] = events[i].data.fd;
     return count < 0 ? 0 : count;

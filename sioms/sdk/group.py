@@ -91,6 +91,10 @@ class Group:
         self._turns = 0
         self._loses = False
         """Whether somebody has just gone, who may have had more than has been seen."""
+        self._stopped_ns = 0
+        """Since when the workcell is stopped, as has been seen [ns]."""
+        self._is_braking = False
+        """Whether devices have just begun a stop, which has yet to show in a tick."""
         self._requests: ChangeWatch | None = None
         self._is_settled = False
         self._of = np.zeros(MOST_FILES, dtype=np.int64)
@@ -114,7 +118,7 @@ class Group:
             if self._loses:  # a process that ends closes one socket after another, if it gets to
                 self._loses = False
                 time.sleep(CLOSING_S)
-            else:
+            elif not self._look_for_stops():
                 self._serve_next()
 
     def _wait(self) -> list[int]:
@@ -279,17 +283,31 @@ class Group:
             member.runtime.running = False
 
     def _heed_requests(self) -> None:
-        """Somebody asks for a stop: all devices brake at once, by steps where these can, and tell of it one by one."""
+        """Somebody asks for a stop: put it into the latch, for all."""
         if self._requests is not None:
             self._requests.drain()
-        for member in self._members.values():
+        for member in list(self._members.values())[:1]:
+            self._guarded(member, member.runtime.stops.latch_request)
+        self._begin_stops()
+
+    def _begin_stops(self) -> None:
+        """Have all brake at once, by steps where these can; they tell of it one by one, behind a tick that shows it."""
+        now_ns, self._is_braking = time.monotonic_ns(), True
+        for fd, member in self._members.items():
             member.owes = True
-        for fd, member in list(self._members.items())[:1]:
-            self._serve(fd, member)  # which puts the stop into the latch
-        now_ns = time.monotonic_ns()
-        owing = {fd: self._is_stopped(member, now_ns) for fd, member in self._members.items() if member.owes}
-        for fd, is_stopped in owing.items():
-            self._rank(fd, CAN_WAIT if is_stopped else STOPS)
+            self._rank(fd, CAN_WAIT if self._is_stopped(member, now_ns) else STOPS)
+
+    def _look_for_stops(self) -> bool:
+        """Begin a stop that has been latched since the last look, of which the daemon tells one device of a process;
+        return whether one has just been begun.
+        """
+        seen_ns = self._stopped_ns
+        for member in list(self._members.values())[:1]:
+            self._stopped_ns = member.runtime.stopped_ns
+        if self._stopped_ns not in (0, seen_ns) and not self._is_braking:
+            self._begin_stops()
+        begun, self._is_braking = self._is_braking, False
+        return begun
 
     def _is_stopped(self, member: Member, now_ns: int) -> bool:
         """Have a member begin its stop by steps; return whether it has, or has been stopped before."""

@@ -64,14 +64,15 @@ class QuietRun:
             orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
             announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
             tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, desk=desk.record, early_ns=0,
-            heeded_ns=0, brakes=0, patient=0, control=control, called=0, spare=np.zeros(MOST_EVENTS, dtype=np.int64),
+            heeded_ns=0, brakes=0, braked_ns=0, patient=0, control=control, called=0,
+            spare=np.zeros(MOST_EVENTS, dtype=np.int64),
             instants=instants, scheduled_ns=0, ticked_ns=0, began_ns=0, number=0, waiting=0, left=0, done=0, expired=0,
             slackens=0, ring=statistics.ring.reshape(-1), ticks=0, skipped=0, longest_ns=0,
         )  # fmt: skip
 
     def lend(
         self, scheduled_ns: int, number: int, watched: bool, announced: int = 0, worked_ns: int = 0,
-        early_ns: int = 0, ticked_ns: int = 0, looked_ns: int = 0,
+        early_ns: int = 0, ticked_ns: int = 0, looked_ns: int = 0, braked_ns: int = 0,
     ) -> bool:  # fmt: skip
         """Let steps tick from now on, until ``take_back``; return False when the loop has to.
 
@@ -82,6 +83,7 @@ class QuietRun:
             early_ns: when an early tick is due, 0: none is [ns].
             ticked_ns: when the last tick was, early ones too [ns].
             looked_ns: all that was asked for before has been heeded [ns].
+            braked_ns: when something was stopped last [ns].
         """
         record, statistics, idling = self.record, self._statistics, self._idling
         until_ns = self._waits.until_ns()
@@ -98,6 +100,7 @@ class QuietRun:
         record.skipped = statistics.skipped
         record.waiting = record.left = record.done = record.expired = record.slackens = record.told = 0
         record.brakes = record.patient = record.called = 0
+        record.braked_ns = braked_ns
         return True
 
     def run(self) -> None:

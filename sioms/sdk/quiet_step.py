@@ -77,7 +77,8 @@ class Quiet(Record):
 
     ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: the loop has yet to
     see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: steps have
-    begun a stop, or a halt. ``patient``: the device waits for its turn in a process of several, and ticks on meanwhile.
+    begun a stop, or a halt; ``braked_ns``: when something was stopped last. ``patient``: the device waits for its turn
+    in a process of several, and ticks on meanwhile.
 
     ``control``: descriptor of the daemon's socket. ``called``: it is among those that are ready. ``spare``: as many
     numbers as ``ready``.
@@ -116,6 +117,7 @@ class Quiet(Record):
     early_ns: int
     heeded_ns: int
     brakes: int
+    braked_ns: int
     patient: int
     control: int
     called: int
@@ -217,8 +219,9 @@ def begin_to_brake(q: Quiet, now_ns: int, latches: int) -> int:
     if q.stop(q.device, now_ns, latches, 0):
         return 1
     q.brakes = 1
+    q.braked_ns = now_ns
     owe(q)
-    if q.lead_ns and q.periods == 1 and not q.announced:
+    if not q.announced:
         tick_soon(q, now_ns)
     return 0
 
@@ -226,17 +229,19 @@ def begin_to_brake(q: Quiet, now_ns: int, latches: int) -> int:
 @step
 def tick_soon(q: Quiet, now_ns: int) -> int:
     """Have a tick off the grid, unless the next one comes as soon: ticks are a quarter of a period apart at least."""
+    if not q.lead_ns or q.periods > 1:
+        return 0
     early_ns = max(now_ns, q.ticked_ns + int(q.period_ns / 4))
-    if early_ns <= last_early_ns(q):
+    if early_ns <= last_early_of(q, q.scheduled_ns):
         q.early_ns = early_ns
         set_timer(q.line_timer, early_ns)
     return 0
 
 
 @step
-def last_early_ns(q: Quiet) -> int:
-    """Return when a tick off the grid may be at the latest [ns]."""
-    return q.scheduled_ns + q.period_ns - int(q.period_ns / 4)
+def last_early_of(q: Quiet, scheduled_ns: int) -> int:
+    """Return when a tick off the grid may be at the latest, after an instant of the grid [ns]."""
+    return scheduled_ns + q.period_ns - int(q.period_ns / 4)
 
 
 @step
@@ -298,19 +303,28 @@ def early_tick(q: Quiet) -> int:
     One that comes too late is left out: the next one of the grid, which may be due already, is for an instant before.
     """
     now_ns = clock_ns()
-    if now_ns > last_early_ns(q):
+    if now_ns > last_early_of(q, q.scheduled_ns):
         q.early_ns = 0
         return DONE
     if q.desk.kept or not may_tick(q, now_ns):
         return LEFT
     if q.tick(q.device, now_ns, q.heeded_ns if q.heeded_ns else now_ns, q.number + 1):
         return LEFT
-    q.early_ns = 0
     q.began_ns = now_ns
-    q.ticked_ns = now_ns
     q.number += 1
     q.done += 1
+    have_ticked(q, now_ns)
     return HEARD if q.heeded_ns else DONE
+
+
+@step
+def have_ticked(q: Quiet, instant_ns: int) -> int:
+    """Note for which instant a tick was; one that has begun to brake since then has another soon, which shows it."""
+    q.early_ns = 0
+    q.ticked_ns = instant_ns
+    if q.braked_ns >= instant_ns:
+        tick_soon(q, clock_ns())
+    return 0
 
 
 @step
@@ -321,13 +335,14 @@ def one_tick(q: Quiet) -> int:
         return LEFT
     count = q.announced if q.announced else q.expired
     scheduled_ns = q.scheduled_ns + count * q.period_ns * q.periods
+    instant_ns = scheduled_ns
+    if q.braked_ns > scheduled_ns and q.braked_ns < began_ns and began_ns <= last_early_of(q, scheduled_ns):
+        instant_ns = began_ns  # it is late, and would show an axis that has begun to brake meanwhile as it was before
     as_of_ns = q.heeded_ns if q.heeded_ns else began_ns
     if q.desk.kept:
         as_of_ns = q.desk.came[0]
-    if q.tick(q.device, scheduled_ns, as_of_ns, q.number + 1):
+    if q.tick(q.device, instant_ns, as_of_ns, q.number + 1):
         return LEFT
-    q.early_ns = 0
-    q.ticked_ns = scheduled_ns
     q.expired = 0
     q.announced = 0
     q.skipped += (count - 1) * q.periods
@@ -335,6 +350,7 @@ def one_tick(q: Quiet) -> int:
     q.began_ns = began_ns
     q.number += 1
     q.done += 1
+    have_ticked(q, instant_ns)
     ended_ns = clock_ns()
     if not q.lead_ns:
         q.slackens = q.slack(q.device, ended_ns, scheduled_ns + q.period_ns, 0)

@@ -119,6 +119,8 @@ class Runtime:
         self._ticked_ns = 0
         self._brakes = False
         """Whether steps have begun the stop that is being heeded."""
+        self._braked_ns = 0
+        """When something was stopped last [ns]."""
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
@@ -298,6 +300,11 @@ class Runtime:
         self.watch(watch.fd, asked)
         self.sees_requests = True
 
+    @property
+    def stopped_ns(self) -> int:
+        """Since when the workcell is stopped, by the latch, 0: it is not [ns]."""
+        return self.latch.stopped_ns
+
     def heed_requests(self) -> None:
         """Look at the stop-request file, which has changed."""
         self._wake()
@@ -380,7 +387,7 @@ class Runtime:
         watched = bool(self.clients.handles) or self._is_used
         lent = self._quiet.lend(
             self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns, early_ns, self._ticked_ns,
-            self.looked_ns,
+            self.looked_ns, self._braked_ns,
         )  # fmt: skip
         return self._quiet if lent else None
 
@@ -400,7 +407,7 @@ class Runtime:
         self._announced, self._slack_ns = quiet.announced, quiet.worked_ns
         due_ns = quiet.scheduled_ns + quiet.announced * self.period_ns if quiet.announced else quiet.early_ns
         self._line_due_ns = due_ns or None
-        self._brakes = quiet.brakes > 0
+        self._brakes, self._braked_ns = quiet.brakes > 0, quiet.braked_ns
         if not quiet.done:
             return
         self.tick, self.looked_ns = quiet.number, quiet.heeded_ns or quiet.began_ns
@@ -415,9 +422,10 @@ class Runtime:
 
     def tick_early(self) -> None:
         """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn."""
-        if not self._lead_ns or self._is_ticking or self._announced:  # the next one of frequent ticks comes as soon
+        if self._brakes:  # by steps, which have seen to that
             return
-        if not self._brakes:  # by steps, which have seen to that
+        self._braked_ns = time.monotonic_ns()
+        if self._lead_ns and not self._is_ticking and not self._announced:  # the next of frequent ticks comes as soon
             self._tick_soon()
 
     def _tick_soon(self) -> None:
@@ -561,7 +569,9 @@ class Runtime:
         engine = self.engine
         self._ticked_ns = scheduled_ns
         engine.tick(scheduled_ns)
-        self._is_ticking = False  # what is stopped by what has been read waits for another tick
+        self._is_ticking = False
+        if self._lead_ns and self._braked_ns >= scheduled_ns:  # it does not show in a tick for an instant before
+            self._tick_soon()
         ticked_ns = time.monotonic_ns()
         self.pages.alive(ticked_ns)
         if isinstance(engine, TickEngine) and engine.publishes:

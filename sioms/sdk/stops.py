@@ -63,6 +63,8 @@ class Reason(NamedTuple):
     errno: int = 0
 
 
+Mark = tuple[int, int]
+"""Of a request to stop, see ``StopRequest.mark``."""
 Part = tuple[AnyBlock, Sequence[int], int]
 """A block, channels of it, and one bit of them (-1: all)."""
 
@@ -147,7 +149,7 @@ class Stops:
         return (*self._seen[:2], self._orders)
 
     @property
-    def seen_request(self) -> tuple[int, int]:
+    def seen_request(self) -> Mark:
         """The mark of the stop-request file that has been seen."""
         return self._seen[2]
 
@@ -165,16 +167,21 @@ class Stops:
         if (latch.stopped_ns, latch.resets, self._request.mark) != self._seen:
             self.look()
 
-    def look(self) -> None:
-        """Do what the latch and the request file say."""
-        latch, (seen_stop, seen_resets, seen_request) = self._latch, self._seen
-        mark = self._request.mark
-        fresh = mark not in (seen_request, latch.answered_request)
+    def latch_request(self) -> tuple[Mark, bool]:
+        """Latch the stop that somebody asks for, and do no more; return what was looked at, and whether it is news."""
+        latch, mark = self._latch, self._request.mark
+        fresh = mark not in (self.seen_request, latch.answered_request)
         if fresh:
             source = self._request.source
             # A reset may have answered it since: a stop that is over must not be latched again.
             if mark != latch.answered_request and latch.stop(time.monotonic_ns(), source):
                 self._tell(Stopped(latch.source))
+        return mark, fresh
+
+    def look(self) -> None:
+        """Do what the latch and the request file say."""
+        latch, (seen_stop, seen_resets, _) = self._latch, self._seen
+        mark, fresh = self.latch_request()
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:

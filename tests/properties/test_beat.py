@@ -38,8 +38,7 @@ def _stop(process: Process, chance: random.Random) -> None:
         process.request_stop()
         return
     process.latch.stop(CLOCK.now_ns, "eva")
-    for device in process.devices:
-        process.order(device, DriverVerb.STOP_CHANGED)
+    process.order(chance.choice(process.devices), DriverVerb.STOP_CHANGED)
 
 
 def _reset(process: Process, chance: random.Random) -> None:

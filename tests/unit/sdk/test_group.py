@@ -18,6 +18,7 @@ class Runtime:
         self.running, self.pause_s, self.did = True, None, []
         self.record, self.timers = SimpleNamespace(address=0, left=0, stopped=0, called=0), ()
         self.ready, self.lost = [], []
+        self.stopped_ns, self.stops = 0, SimpleNamespace(latch_request=lambda: self._do("latch request"))
 
     def _do(self, what):
         self.did.append(what)
@@ -73,7 +74,7 @@ def start(group, *fails_in):
     return members
 
 
-@pytest.mark.parametrize("where", ["start", "lend", "take back", "serve", "heed requests"])
+@pytest.mark.parametrize("where", ["start", "lend", "take back", "serve", "latch request", "heed requests"])
 def test_what_a_device_raises_ends_it_alone(group, where):
     bad, good = start(group, where, "")
     for member in (bad, good):
@@ -84,7 +85,7 @@ def test_what_a_device_raises_ends_it_alone(group, where):
         group._serve_next()
     assert bad.runtime.did[-2:] == [f"stopped: {where}", "released"], "stopped first, and once"
     assert bad.runtime.did.count("released") == 1 and not bad.runtime.running
-    assert good.runtime.did == [
+    assert [did for did in good.runtime.did if did != "latch request"] == [
         "start",
         "lend",
         "take back",
@@ -149,9 +150,26 @@ def test_who_is_stopped_already_does_not_go_first_when_somebody_stops(group):
     group._heed_requests()
     found = [group._due[rank] for rank in (STOPS, STANDS, CALLED, CAN_WAIT)]
     assert [[*each] for each in found] == [
-        [moving.runtime.poll_fd], [standing.runtime.poll_fd], [], [stopped.runtime.poll_fd],
+        [first.runtime.poll_fd, moving.runtime.poll_fd], [standing.runtime.poll_fd], [], [stopped.runtime.poll_fd],
     ]  # fmt: skip
-    assert first.runtime.did[-3:-1] == ["heed requests", "serve"]
+    assert first.runtime.did[-1] == "latch request" and "latch request" not in moving.runtime.did, "once for all"
+
+
+def test_a_stop_is_begun_by_all_and_shown_before_one_is_served(group, monkeypatch):
+    """The daemon tells one device of a process; the tick that shows the stop comes before what follows from it."""
+    begun = []
+    monkeypatch.setattr("sioms.sdk.group.begin_stop", lambda record, now_ns: begun.append(record) or 0)
+    members = start(group, "", "", "")
+    assert not group._look_for_stops() and not begun
+    for member in members:
+        member.runtime.stopped_ns = 5
+    assert group._look_for_stops() and [id(r) for r in begun] == [id(m.runtime.record) for m in members]
+    assert all(member.owes for member in members) and not group._look_for_stops(), "once"
+    group._heed_requests()
+    assert group._look_for_stops() and not group._look_for_stops()
+    for member in members:
+        member.runtime.stopped_ns = 0
+    assert not group._look_for_stops(), "a reset"
 
 
 def test_whose_owner_has_gone_halts_by_steps_or_goes_first_and_is_ended_before_anything_else(group):

@@ -79,8 +79,8 @@ class Device:
             "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns, "announced": 0,
             "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
             "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
-            "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0, "patient": 0, "called": 0,
-            "control": self.control, "desk": Desk.empty(), "spare": np.zeros(64, dtype=np.int64),
+            "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0, "braked_ns": 0, "patient": 0,
+            "called": 0, "control": self.control, "desk": Desk.empty(), "spare": np.zeros(64, dtype=np.int64),
             "done": 0, "expired": 1, "slackens": 0, "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
         }  # fmt: skip
         for name, function in (
@@ -303,9 +303,33 @@ def test_a_stop_has_a_tick_soon_but_not_sooner_than_a_quarter_of_a_period(make):
     assert len(device.ticks) == 1 and device.quiet.scheduled_ns == last_ns and device.quiet.ticked_ns > last_ns
 
 
+def test_a_late_tick_is_for_now_where_somebody_has_stopped_since(make):
+    """For the instant at which it was due it would show an axis as it was before it braked."""
+    period_ns, now_ns = 10_000_000_000, time.monotonic_ns()
+    last_ns = now_ns - 12 * period_ns // 10
+    device = make(
+        lead_ns=1, period_ns=period_ns, scheduled_ns=last_ns, ticked_ns=last_ns, announced=1, began_ns=77
+    )  # fmt: skip
+    device.stops, device.latch[STOPPED] = 0, 5
+    assert begin_stop(device.quiet, now_ns) == 0 and not device.quiet.early_ns, "a tick is due"
+    assert one_tick(device.quiet) == HEARD
+    assert device.ticks[-1][0] > now_ns and device.quiet.ticked_ns > now_ns and not device.quiet.early_ns
+    assert device.quiet.scheduled_ns == last_ns + period_ns, "the grid stays"
+
+
+def test_a_stop_that_a_tick_heeds_shows_in_another_a_quarter_of_a_period_later(make):
+    period_ns, last_ns = 10_000_000_000, time.monotonic_ns() - 10_000_000_000
+    device = make(
+        lead_ns=1, period_ns=period_ns, scheduled_ns=last_ns, ticked_ns=last_ns, announced=1, began_ns=77
+    )  # fmt: skip
+    device.stops, device.latch[STOPPED] = 0, 5
+    assert one_tick(device.quiet) == HEARD and device.ticks[-1][0] == last_ns + period_ns
+    assert device.quiet.early_ns == last_ns + period_ns + period_ns // 4
+
+
 def test_a_tick_that_is_announced_is_never_put_off(make):
     """A device whose count of ticks ran ahead put its tick off at every period, and never ticked again."""
-    device = make(lead_ns=200_000, expired=0, scheduled_ns=time.monotonic_ns() + 2 * PERIOD_NS, announced=1)
+    device = make(lead_ns=200_000, expired=0, scheduled_ns=time.monotonic_ns() + 300 * PERIOD_NS, announced=1)
     device.line.set(due_ns := device.quiet.scheduled_ns + PERIOD_NS)
     for _ in range(3):
         os.eventfd_write(device.timer, 1)
