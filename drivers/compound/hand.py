@@ -3,7 +3,8 @@
 A device made of devices, see drivers/compound/README.md. With a table ``squeeze`` d takes force commands: an internal
 force [N], positive squeezes. In free space d then yields as a virtual spring about where it was, in contact it follows
 the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. The node
-``force`` shows that force and how late all this is. hand.toml is an example without a sense of
+``force`` shows that force and how late all this is, the node ``model`` what the hand is known to be: what is stated, or
+what ``model_file`` says, which ``sioms reconcile hand`` writes. hand.toml is an example without a sense of
 touch, etc/hand.toml a whole hand with fingers that feel.
 
 Lengths in metres, angles in radians.
@@ -12,14 +13,18 @@ Lengths in metres, angles in radians.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import zlib
+from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import msgspec
 
+from sioms.documents import read_text
 from sioms.hand.control import Controller, Gains
 from sioms.hand.felt import felt, internal_force, wrist_force
 from sioms.hand.kinematics import COORDINATES, LINK_M, UNITS, Hand
+from sioms.hand.model import HandModel, model_of
 from sioms.hand.statics import damped_limit, filtered_limit
 from sioms.motion.axis_step import FORCE
 from sioms.protocol.flags import AnalogStatus, NodeClass
@@ -27,6 +32,7 @@ from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, AnyBlock, BlockSpec, Description, unfit
 from sioms.sdk.driver import Kit
 from sioms.sdk.inputs import NotMeasuredError
+from sioms.tactile.sensing import CHANNELS
 
 from .compound import Compound, CompoundSettings
 from .readings import Reading
@@ -37,6 +43,13 @@ _BEND_S = 0.05
 """Time constant of the bend of a link in its torque, in the hand's own time [s]: a servo that chases its encoder's
 steps does not shake d."""
 _INVALID = int(AnalogStatus.INVALID)
+MODEL_CHANNELS = (
+    *((f"link{i}", "m", "length of a link") for i in (1, 2)),
+    *((f"mount{i}", "rad", "angle by which a finger is turned on its link") for i in (1, 2)),
+    *((f"stiffness{i}", "N*m/rad", "of a link and its finger behind the encoder") for i in (1, 2)),
+    *((f"gain{i}", "", "relative departure of the load that a finger tells") for i in (1, 2)),
+    ("friction", "", "least coefficient, to be relied on"),
+)
 _CHANNELS = (
     ("force", "N", "internal force, from what `squeeze` reads; positive squeezes"),
     ("filtered", "N", "the same behind the law's low-pass"),
@@ -84,6 +97,7 @@ class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw
 
     Attributes:
         link1_m, link2_m: from the revolute axis of a module to its finger's centre.
+        model_file: what the hand is known to be (sioms.hand.model); its links and stiffnesses replace the stated ones.
         least_m: the least d that has a direction; how far the hand may close says the d of the coordinates.
         link_stiffness: of each link and its finger behind the encoder of its axis [N m/rad]; infinite: none gives.
         squeeze: how it squeezes; without it d takes no force commands.
@@ -92,6 +106,7 @@ class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw
 
     link1_m: float = LINK_M
     link2_m: float = LINK_M
+    model_file: str = ""
     least_m: float = 1e-3
     link_stiffness: float = math.inf
     squeeze: SqueezeTable | None = None
@@ -111,7 +126,7 @@ class HandDriver(Compound):
     @classmethod
     def transform(cls, settings: HandSettings) -> Hand:
         """Return the map."""
-        return Hand(settings.link1_m, settings.link2_m, settings.least_m)
+        return known(settings).maps(settings.least_m)
 
     @classmethod
     def presses(cls, settings: HandSettings, axis: Any) -> bool:
@@ -124,23 +139,24 @@ class HandDriver(Compound):
         base = super().describe(name, settings)
         if any(axis.force_node for axis in settings.axis):
             raise ValueError("axis: has a force_node; want the table squeeze, which says from where the force comes")
-        if not settings.link_stiffness > 0.0:
-            raise ValueError(f"link_stiffness {settings.link_stiffness:g} N m/rad; want more than 0")
         if not 0.0 < settings.pace <= 1.0:
             raise ValueError(f"pace {settings.pace:g}; want above 0, at most 1")
+        model = _spec("model", _model_channels(settings), settings.history)
         squeeze = settings.squeeze
         if squeeze is None:
-            return base
+            return Description((*base.blocks, model), base.tick_hz, base.inputs, holds=base.holds)
         _check(squeeze, settings)
-        channels = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _CHANNELS)
-        block = BlockSpec("force", NodeClass.ANALOG, channels, history=settings.history)
-        return Description((*base.blocks, block), base.tick_hz, _nodes(squeeze), holds=base.holds)
+        force = _spec("force", _CHANNELS, settings.history)
+        return Description((*base.blocks, force, model), base.tick_hz, _nodes(squeeze), holds=base.holds)
 
     def __init__(self, name: str, settings: HandSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
-        squeeze = settings.squeeze
+        squeeze, self._model = settings.squeeze, known(settings)
         self._controller = Controller(_gains(squeeze, settings)) if squeeze is not None else None
-        self._shown_force = AnalogBlock(self.describe(name, settings).blocks[1]) if squeeze is not None else None
+        *shown, model = self.describe(name, settings).blocks[1:]
+        self._shown_force = AnalogBlock(shown[0]) if shown else None
+        self._shown_model = AnalogBlock(model)
+        self._shown_model.data[:] = numbers(self._model)
         self._force: float | None = None
         self._why = "not read yet"
         self._force_age_s = math.inf
@@ -152,8 +168,9 @@ class HandDriver(Compound):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The coordinates, and the force."""
-        return (self._block,) if self._shown_force is None else (self._block, self._shown_force)
+        """The coordinates, the force, and what the hand is known to be."""
+        force = () if self._shown_force is None else (self._shown_force,)
+        return (self._block, *force, self._shown_model)
 
     def tick(self, now_ns: int) -> None:
         """Take the force, then as any device made of devices."""
@@ -170,7 +187,7 @@ class HandDriver(Compound):
         self._bent_ns = taken.stamp_ns
         share = 1.0 - math.exp(-passed_s * self.settings.pace / _BEND_S)
         for n, i in enumerate(_TH):
-            self._bend[n] += share * (taken.load[i] / self.settings.link_stiffness - self._bend[n])
+            self._bend[n] += share * (taken.load[i] / self._model.joint_stiffness[n] - self._bend[n])
             joints[i] -= self._bend[n]
         return joints
 
@@ -212,6 +229,11 @@ class HandDriver(Compound):
             if reading is None:
                 self._why = f"{node}: it cannot be read; want its device up"
                 return
+            count = len(reading["value"])
+            if count != len(CHANNELS) if squeeze.fingers else count < 2:
+                kind = "the shape of a finger that has a calibration" if squeeze.fingers else "fx and fy of a wrist"
+                self._why = f"{node}: it has {count} channels; want {kind}"
+                return
             stamp_ns = self.kit.inputs[node].stamp_ns
             oldest_ns, newest_ns = min(oldest_ns, stamp_ns), max(newest_ns, stamp_ns)
             if now_ns - stamp_ns > squeeze.age_max_s * 1e9:
@@ -224,7 +246,7 @@ class HandDriver(Compound):
                 return
             rows.append(reading)
         self._force_age_s, self._newest_ns = (now_ns - oldest_ns) * 1e-9, newest_ns
-        self._force = _internal(squeeze, [row["value"] for row in rows], self._at)
+        self._force = _internal(squeeze, [row["value"] for row in rows], self._at, self._model)
         if self._force is None:
             self._why = "a finger cannot tell whether anything touches it"
             return
@@ -246,10 +268,52 @@ def _nodes(squeeze: SqueezeTable) -> tuple[str, ...]:
     return squeeze.fingers or squeeze.wrists or ()
 
 
-def _internal(squeeze: SqueezeTable, rows: Sequence[Any], at: Sequence[float]) -> float | None:
+def known(settings: HandSettings) -> HandModel:
+    """Return what the hand is known to be.
+
+    Raises:
+        ValueError: a number out of its range, or a model that cannot be read or is none.
+    """
+    Hand(settings.link1_m, settings.link2_m)  # says by its key what it refuses
+    if not settings.link_stiffness > 0.0:
+        raise ValueError(f"link_stiffness {settings.link_stiffness:g} N m/rad; want more than 0")
+    stated = HandModel((settings.link1_m, settings.link2_m), joint_stiffness=(settings.link_stiffness,) * 2)
+    if not settings.model_file:
+        return stated
+    try:
+        return model_of(read_text(Path(settings.model_file)), stated)
+    except OSError as error:
+        why = f"{error.strerror}; sioms reconcile hand writes one"
+    except ValueError as error:
+        why = str(error)
+    raise ValueError(f"model_file {settings.model_file}: {why}")
+
+
+def numbers(model: HandModel) -> tuple[float, ...]:
+    """Return a model as the node ``model`` shows it."""
+    return (*model.link_m, *model.mount_rad, *model.joint_stiffness, *model.load_gain, model.friction)
+
+
+def _model_channels(settings: HandSettings) -> Iterator[tuple[str, str, str]]:
+    """Yield the channels of the node ``model``; which file it is of, so that a reload sees another."""
+    file = settings.model_file
+    of = f", model {zlib.crc32(repr(known(settings)).encode()):08x}" if file else ""
+    for name, unit, what in MODEL_CHANNELS:
+        yield name, unit, what + of
+
+
+def _spec(name: str, channels: Iterable[tuple[str, str, str]], history: int) -> BlockSpec:
+    told = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in channels)
+    return BlockSpec(name, NodeClass.ANALOG, told, history=history)
+
+
+def _internal(
+    squeeze: SqueezeTable, rows: Sequence[Any], at: Sequence[float], model: HandModel
+) -> float | None:  # fmt: skip
     one, two = rows
     if squeeze.fingers:
-        return internal_force(felt(one.tolist(), squeeze.length_m), felt(two.tolist(), squeeze.length_m))
+        feels = [model.corrected(felt(row.tolist(), squeeze.length_m), i) for i, row in enumerate(rows)]
+        return internal_force(*feels)
     return wrist_force(one[:2].tolist(), two[:2].tolist(), at[PSI], squeeze.contact_n) if at else 0.0
 
 

@@ -16,6 +16,16 @@ _VAR_ANGLE, _VAR_RADIUS = _AT["var_angle"], _AT["var_radius"]
 _NO_FLAGS = Felt(False)
 
 
+def no_shape(node: str, channels: Sequence[str]) -> str:
+    """Say why a node does not tell what a finger feels, from the names of its channels; '' when it does."""
+    if tuple(channels) == tuple(_AT):
+        return ""
+    return (
+        f"{node}: its channels are {', '.join(channels[:4])}{', ...' if len(channels) > 4 else ''}; want the node "
+        "shape of a finger that has a calibration (sioms tactile calibrate)"
+    )
+
+
 def felt(shape: Sequence[float], length_m: float) -> Felt:
     """Return what a finger feels.
 
@@ -23,7 +33,10 @@ def felt(shape: Sequence[float], length_m: float) -> Felt:
         shape: the channels of its `shape` node (`sioms.tactile.sensing.CHANNELS`).
         length_m: of the contact along the finger: force over line load.
     """
-    quality = Quality(int(shape[_QUALITY])) if math.isfinite(shape[_QUALITY]) else Quality.BLIND
+    touched, told = shape[TOUCHED], shape[_QUALITY]
+    if not math.isfinite(told) or told % 1.0 or (touched not in (0.0, 1.0) and not math.isnan(touched)):
+        return Felt(None)  # strains, of which a finger has as many
+    quality = Quality(int(told))
     state = state_of(quality)
     if state is State.UNTOUCHED or Quality.WRONG_SIGN in quality:
         return _NO_FLAGS

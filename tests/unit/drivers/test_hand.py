@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -10,13 +11,18 @@ import numpy as np
 import pytest
 from hand_cell_rig import HandCell, write
 
-from sioms.drivers.compound.hand import HandDriver
+from sioms.drivers.compound.hand import MODEL_CHANNELS, HandDriver, known, numbers
 from sioms.drivers.sim.axes import SimAxes
 from sioms.drivers.sim.world import SimWorld
+from sioms.hand.felt import no_shape
 from sioms.hand.follow import D
+from sioms.hand.kinematics import Hand
+from sioms.hand.model import model_of, to_toml
+from sioms.hand.touch import Felt
 from sioms.motion import CommandError
 from sioms.motion.commands import WIRE_DTYPE
 from sioms.protocol.flags import AnalogStatus, AxisStatus, ControlMode
+from sioms.tactile.sensing import CHANNELS
 
 FAULT = int(AxisStatus.FAULT)
 
@@ -69,6 +75,78 @@ def test_a_force_that_meets_nothing_closes_no_further_than_the_spring_yields(cel
     write(free.bank, [(D, True, 1.0)], free.now_ns)
     free.advance(3.0)
     assert before - free.coordinates[D] == pytest.approx(1.0 / 100.0, abs=5e-4)  # f/K_s
+
+
+def test_a_model_file_says_what_the_hand_is_and_its_node_shows_it(tmp_path: Path) -> None:
+    """A longer link moves the coordinates, a finger's mount and load are for whoever reads the node."""
+    path = tmp_path / "hand-model.toml"
+    path.write_text("[hand]\nlink_m = [0.142, 0.14]\nmount_rad = [0.0, 0.026]\nload_gain = 0.1\nfriction = 1.2\n")
+    settings = table(model_file=str(path), link_stiffness=3.0)
+    assert HandDriver.transform(settings) == Hand(0.142, 0.14, settings.least_m)
+    known_as = known(settings)
+    assert numbers(known_as) == (0.142, 0.14, 0.0, 0.026, 3.0, 3.0, 0.1, 0.1, 1.2)
+    assert known_as == model_of(to_toml(known_as))
+    felt = known_as.corrected(Felt(True, 1.5, 0.01, 1.1), 1)
+    assert (felt.phi, felt.force) == pytest.approx((1.526, 1.0))
+    shown = [block.channels for block in HandDriver.describe("hand", settings).blocks if block.name == "model"]
+    assert [channel.name for channel in shown[0]] == [name for name, _, _ in MODEL_CHANNELS]
+    other = HandDriver.describe("hand", table(link_stiffness=3.0))
+    assert shown[0] != other.blocks[-1].channels  # a reload takes the other one up
+
+
+def test_links_as_modelled_put_the_coordinates_where_the_fingers_are(tmp_path: Path) -> None:
+    path = tmp_path / "hand-model.toml"
+    path.write_text("[hand]\nlink_m = [0.142, 0.14]\n")
+
+    def longer(tables: dict[str, Any]) -> None:
+        tables["hand"]["model_file"] = str(path)
+        tables["world"]["finger"][0]["mount"]["link_m"] = 0.142
+
+    cell = HandCell(longer, compiled=False)
+    one, two = (finger.centre for finger in cell.world.fingers)
+    assert cell.coordinates[:2] == pytest.approx([0.5 * (a + b) for a, b in zip(one, two, strict=True)], abs=1e-4)
+    assert cell.coordinates[D] == pytest.approx(math.dist(one, two), abs=2e-4)
+    assert list(cell.drivers["hand"].blocks[-1].data[:2]) == [0.142, 0.14]
+
+
+@pytest.mark.parametrize(("text", "said"), [
+    (None, "No such file or directory; sioms reconcile hand writes one"),
+    ("[hand]\nlinks = 1\n", "nobody reads links"),
+    ("[hands]\n", "want [hand] alone"),
+    ("[hand]\nlink_m = -1\n", "want above 0"),
+    ("[hand]\nlink_m = [1, 2, 3]\n", "want a number, or two"),
+    ("[hand]\nload_gain = -1\n", "want above -1"),
+    ("[hand]\nmount_rad = nan\n", "want finite numbers"),
+])  # fmt: skip
+def test_a_model_file_that_is_none_is_refused(tmp_path: Path, text: str | None, said: str) -> None:
+    path = tmp_path / "m.toml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match="model_file") as refused:
+        HandDriver.describe("hand", table(model_file=str(path)))
+    assert said in str(refused.value)
+
+
+@pytest.mark.parametrize(("node", "said"), [
+    ("touch2.strain", "a finger cannot tell whether anything touches it"),
+    ("touch2.strain.e3", "touch2.strain.e3: it has 1 channels; want the shape of a finger"),
+])  # fmt: skip
+def test_a_node_that_is_no_shape_of_a_finger_tells_no_force(node: str, said: str) -> None:
+    """Sixteen raw strains were taken for a shape, one of them for the load."""
+
+    def raw(tables: dict[str, Any]) -> None:
+        tables["hand"]["squeeze"]["fingers"] = ["touch1.shape", node]
+
+    cell = HandCell(raw, compiled=False)
+    write(cell.bank, [(D, True, 0.5)], cell.now_ns)
+    cell.advance(0.02)
+    assert cell.bank.rows["status"][D].astype(int) & FAULT
+    assert said in cell.bank.fault_text(D)
+
+
+def test_a_shape_is_known_by_its_channels() -> None:
+    assert no_shape("touch2.shape", [name for name, _, _ in CHANNELS]) == ""
+    assert "its channels are e0, e1, e2, e3, ...; want the node shape" in no_shape("t", [f"e{i}" for i in range(16)])
 
 
 def test_the_node_force_tells_how_late_it_is(cell: HandCell) -> None:
