@@ -155,13 +155,14 @@ class PlaneHand:
         return grasp_of(one.centre, two.centre, one.phi + one.place[2], two.phi + two.place[2], FINGER_M)
 
     def beside(self) -> list[float]:
-        """Return the commanded joints [m, rad], and the forces of the object on both fingers [N]."""
+        """Return joints, places, loads, commanded joints, and the forces of the object on both fingers [m, rad, N]."""
         forces: list[float] = []
         for finger in self.world.fingers:
             angle = finger.phi + finger.place[2]
             c, s = math.cos(angle), math.sin(angle)
             forces += [finger.tangential * s - finger.normal * c, -finger.normal * s - finger.tangential * c]
-        return [*self.joints, *forces]
+        one, two = self._felt
+        return [*self.reading.joints, one.phi, two.phi, one.force, two.force, *self.joints, *forces]
 
     def is_held(self) -> bool:
         """Return whether both fingers truly touch the object."""

@@ -14,16 +14,19 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from sioms.hand.contacts import FINGER_M
 from sioms.hand.kinematics import Hand
+from sioms.hand.regrasp import NEUTRAL
 from sioms.hand.skills import STILL, Skills
 from sioms.hand.touch import Failed, Manner, Reading, Setpoint, State
 
 OTHER, DISK, BAR = 0, 1, 2
 LOADS_N = (0.5, 1.0, 1.8)
+SLIPS_N = (0.4, 0.8, 1.6, 2.4)
 COLUMNS = (
     "time", "grasp", "kind", "thing", "size", *(f"{joint}{i}" for i in (1, 2) for joint in ("x", "y", "th")), "place1",
     "place2", "load1", "load2", *(f"cmd_{joint}{i}" for i in (1, 2) for joint in ("x", "y", "th")), "fx1", "fy1", "fx2",
@@ -32,10 +35,12 @@ COLUMNS = (
 """Of a recording, as ``sioms reconcile hand`` reads them."""
 PSI, PHI = 1.0, (1.0, 2.1)
 """Directions of the line of contacts from minus to plus [rad], and angles of the fingers [rad], of a survey."""
-SETTLED_S = 1.0  # under each force: while the damper still moves, the joints' damping bears a part of it
+SETTLED_S = 1.8  # under each force: while the damper still moves, the joints' damping bears a part of it
+DRAG, DRAG_S = 5e-3, 0.6  # speed at which fingers are dragged along a clamped bar [m/s], and for how long first
 TRIES = 3  # grasps that fail one after the other
-#: What a hand tells beside its readings: commanded joints [m, rad] and the wrists' forces [N]; nan where not known.
-Beside = Callable[[], Sequence[float]]
+#: What a hand's devices tell by themselves: x1, y1, th1, x2, y2, th2 as the encoders read them, places, loads, the same
+#: joints as commanded, and the wrists' forces fx1, fy1, fx2, fy2 [m, rad, N]; nan where not known.
+Told = Callable[[], Sequence[float]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,23 +113,38 @@ class Survey(Skills):
         self.thing, self.rows = thing, list[list[float]]()
         self._number = 0
 
-    def carry_out(self, plan: Sequence[Setting], beside: Beside, first: int = 0) -> Generator[Setpoint, Reading, int]:
+    def carry_out(self, plan: Sequence[Setting], told: Told, first: int = 0) -> Generator[Setpoint, Reading, int]:
         """Make grasps; return how many were recorded.
 
         Args:
             plan: the grasps; the object lies between the fingers as they are, a bar with its sides across the line.
-            beside: asked with every frame.
+            told: asked with every frame.
             first: number of the first grasp.
 
         Raises:
             Failed: several grasps one after the other; the hand has opened or is frozen.
         """
+        found = yield from self._all(plan, told, first, self._one)
+        return found
+
+    def slide(self, plan: Sequence[Setting], told: Told, first: int = 0) -> Generator[Setpoint, Reading, int]:
+        """Close on a bar that is clamped to the platen, drag both fingers along it, and record how they slide.
+
+        The links are across the line of centres, so that their stiff axes bear the friction. Directions and angles of
+        the plan do not count, its forces do. Args, Returns and Raises as of ``carry_out``.
+        """
+        found = yield from self._all(plan, told, first, self._dragged)
+        return found
+
+    def _all(
+        self, plan: Sequence[Setting], told: Told, first: int, one: Callable[..., Generator[Setpoint, Reading, Any]]
+    ) -> Generator[Setpoint, Reading, int]:
         self._what = "survey object"
         middle, failed = self._goal[:2], 0
         for setting in plan:
             try:
                 before = len(self.rows)
-                middle = yield from self._one(setting, middle, beside, first + self._number)
+                middle = yield from one(setting, middle, told, first + self._number)
                 failed = 0
                 self._number += 1
             except Failed as fault:
@@ -140,23 +160,45 @@ class Survey(Skills):
         return self._number
 
     def _one(
-        self, setting: Setting, middle: Sequence[float], beside: Beside, number: int
+        self, setting: Setting, middle: Sequence[float], told: Told, number: int
     ) -> Generator[Setpoint, Reading, list[float]]:
         """Roll the fingers, close, feel under each force, turn the object towards what comes; return where it is."""
+        yield from self._take(middle, (setting.phi1, setting.phi2))
+        yield from self._turn(setting.psi, setting.loads[0])
+        for force in setting.loads:
+            yield from self._settle(force, SETTLED_S)
+            self.rows.append((yield from self._record(force, told, number)))
+        seen = self._seen()
+        yield from self._open()
+        return [0.5 * (a + b) for a, b in zip(seen.contact1, seen.contact2, strict=True)]
+
+    def _dragged(
+        self, setting: Setting, middle: Sequence[float], told: Told, number: int
+    ) -> Generator[Setpoint, Reading, list[float]]:
+        """Drag the closed fingers along the object, to and fro with the grasps; return where the hand closes next."""
+        yield from self._take(middle, (NEUTRAL, NEUTRAL))
+        psi, sign = self._goal[2], 1.0 if number % 2 else -1.0
+        along = (-sign * DRAG * math.sin(psi), sign * DRAG * math.cos(psi), 0.0, 0.0, 0.0, 0.0)
+        for force in setting.loads:
+            yield from self._settle(force, 0.5)
+            begun_s = self.now.time_s
+            while self.now.time_s - begun_s < DRAG_S:
+                yield from self._follow(along, force)
+            for finger in (1.0, 2.0):
+                row = yield from self._record(force, told, number, along)
+                self.rows.append([*row[:-1], finger])
+        yield from self._open()
+        return list(middle)
+
+    def _take(self, middle: Sequence[float], phi: tuple[float, float]) -> Generator[Setpoint, Reading, None]:
+        """Roll the fingers, and close lightly about a place."""
         opened = self.thing.apart_m + 2.0 * FINGER_M + 2.0 * self.manner.clearance_m
-        target = (middle[0], middle[1], self._goal[2], opened, setting.phi1, setting.phi2)
+        target = (middle[0], middle[1], self._goal[2], opened, *phi)
         self._check_sensors("survey object")
         self._check_reach("survey object", target)
         yield from self._move(target)
         yield from self._close()
         yield from self._settle(self.manner.light_n, 0.25)
-        yield from self._turn(setting.psi, setting.loads[0])
-        for force in setting.loads:
-            yield from self._settle(force, SETTLED_S)
-            self.rows.append((yield from self._record(force, beside, number)))
-        seen = self._seen()
-        yield from self._open()
-        return [0.5 * (a + b) for a, b in zip(seen.contact1, seen.contact2, strict=True)]
 
     def _turn(self, psi: float, force: float) -> Generator[Setpoint, Reading, None]:
         """Turn the hand with what it holds."""
@@ -164,8 +206,10 @@ class Survey(Skills):
         while abs(left := math.remainder(psi - self._goal[2], math.tau)) > 5e-3:
             yield from self._follow((0.0, 0.0, math.copysign(min(rate, 3.0 * abs(left)), left), 0.0, 0.0, 0.0), force)
 
-    def _record(self, force: float, beside: Beside, number: int) -> Generator[Setpoint, Reading, list[float]]:
-        """Average frames while the hand keeps still; return a row.
+    def _record(
+        self, force: float, told: Told, number: int, along: Sequence[float] = STILL
+    ) -> Generator[Setpoint, Reading, list[float]]:
+        """Average frames while the hand keeps still, or slides evenly; return a row.
 
         Raises:
             Failed: a finger is doubtful in more than half of them.
@@ -173,11 +217,10 @@ class Survey(Skills):
         self.state, count = State.SENSE, self.manner.frames
         frames = []
         for _ in range(2 * count):
-            yield from self._tick((0.0, 0.0), force)
+            yield from self._follow(along, force)
             one, two = self.now.fingers
             if one.touched and two.touched and not one.doubt and not two.doubt:
-                told = (one.phi, two.phi, one.force, two.force)
-                frames.append([*self.now.joints, *told, *beside()])
+                frames.append(list(told()))
         if len(frames) < count:
             yield from self._sense(force)  # says which finger, and why
         mean = np.mean(frames or [[math.nan] * 20], axis=0)
@@ -189,6 +232,17 @@ class Survey(Skills):
         self.state, self._held = State.FAULT, False
         yield from self._let_go()
         yield from self._open()
+
+
+def continued(past: Sequence[Sequence[float]], rows: Sequence[Sequence[float]]) -> list[list[float]]:
+    """Return rows after those of the same session before; their time goes on."""
+    began = past[-1][0] if past else 0.0
+    return [*(list(row) for row in past), *([row[0] + began, *row[1:]] for row in rows)]
+
+
+def next_grasp(past: Sequence[Sequence[float]]) -> int:
+    """Return the number of the first grasp after those of a session."""
+    return int(past[-1][1]) + 1 if past else 0
 
 
 def text_of(rows: Sequence[Sequence[float]]) -> str:

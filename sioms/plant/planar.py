@@ -21,6 +21,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -44,6 +45,7 @@ class Mount:
         damping_ratio: of each joint with its own mass.
         length_m: of the contact along the finger: force over line load.
         friction: coefficient, or None for that of table 4.2 by the contact's relative radius.
+        friction_by_load: normal forces [N], rising, each with a factor of the coefficient there; none: 1 at all.
         loss_s: the normal force grows by this share for each m/s of closing [s/m].
         shear_loss_s: damping over stiffness of the tangential spring [s].
         creep: whether rolling lets tangential stress go.
@@ -57,6 +59,7 @@ class Mount:
     damping_ratio: float = 0.7
     length_m: float = 20e-3
     friction: float | None = None
+    friction_by_load: tuple[tuple[float, float], ...] = ()
     loss_s: float = 1.0
     shear_loss_s: float = 3e-4
     creep: bool = True
@@ -80,6 +83,18 @@ class Mount:
                 raise ValueError(f"describe finger's mount: {name} is {getattr(self, name)}; want 0 or more, finite")
         if self.friction is not None and not 0.0 <= self.friction < math.inf:
             raise ValueError(f"describe finger's mount: friction is {self.friction}; want 0 or more, finite")
+        loads = [load for load, _ in self.friction_by_load]
+        odd = loads != sorted(set(loads)) or not all(0.0 <= factor < math.inf for _, factor in self.friction_by_load)
+        if odd or not all(map(math.isfinite, loads)):
+            raise ValueError(
+                f"describe finger's mount: friction_by_load is {self.friction_by_load}; want forces that rise, "
+                "each with a factor of 0 or more"
+            )
+
+    def coefficient(self, radius_m: float, normal: float) -> float:
+        """Return the coefficient of friction of a contact with this relative radius [m], under a normal force [N]."""
+        plain = friction(radius_m) if self.friction is None else self.friction
+        return plain * _between(self.friction_by_load, normal) if self.friction_by_load else plain
 
 
 @dataclass(slots=True)
@@ -316,7 +331,7 @@ class World:
         closing, across = ux * nx + uy * ny, uy * nx - ux * ny
         normal = m.length_m * load * max(0.0, 1.0 + m.loss_s * closing)
         stiff = m.length_m * shear
-        coefficient = friction(radius) if m.friction is None else m.friction
+        coefficient = m.coefficient(radius, normal)
         stretch = finger.stretch
         if m.creep:
             stretch *= math.exp(-abs(rolled) * reach * width * shear / (2.0 * radius * load))
@@ -406,6 +421,16 @@ class World:
         deep = math.hypot(mx, my)
         segment = limit * math.atan2(chord, deep) - chord * deep
         return chord, cap + segment, turn + math.atan2(my, mx), deep - 0.5 * cap / chord, cx, cy
+
+
+def _between(curve: Sequence[tuple[float, float]], at: float) -> float:
+    """Return the value of a curve of points, beyond its ends that of the end."""
+    if at <= curve[0][0]:
+        return curve[0][1]
+    for (low, first), (high, last) in pairwise(curve):
+        if at < high:
+            return first + (last - first) * (at - low) / (high - low)
+    return curve[-1][1]
 
 
 def _crossing(ax: float, ay: float, bx: float, by: float, limit: float) -> tuple[float, float]:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sioms.arguments import positive, whole
+from sioms.hand.command.arguments import add_beside, add_hand
 
 if TYPE_CHECKING:
     from sioms.hand.survey import Setting, Survey, Thing
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
 GRASPS = 20
 MOST_S = 24 * 3600.0
 FINGERS = ("finger1", "finger2")
+CLAMPED_KG, CLAMPED = 50.0, 5.0  # mass and coefficient on the platen of an object that no finger moves
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,8 +38,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--grasps", type=whole(1), default=GRASPS, metavar="N", help=f"number of grasps (default {GRASPS})"
     )
     parser.add_argument(
-        "--forces", type=positive, nargs="+", default=[0.5, 1.0, 1.8], metavar="N",
-        help="internal forces of each grasp in newtons (default 0.5 1 1.8)",
+        "--forces", type=positive, nargs="+", metavar="N",
+        help="internal forces of each grasp in newtons (default 0.5 1 1.8; with --slips 0.4 0.8 1.6 2.4)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--slips", action="store_true",
+        help="the bar is clamped to the platen: drag both fingers along it and record what friction holds against that",
     )  # fmt: skip
     parser.add_argument("--append", action="store_true", help="continue FILE: another object in the same session")
     parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="seed of the grasps (default 1)")
@@ -45,19 +51,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--hidden", type=Path, metavar="FILE", help="with --plane: what the simulated hand hides (TOML)"
     )
-    parser.add_argument("--node", default="hand", metavar="NAME", help="the hand's node (default hand)")
-    parser.add_argument(
-        "--fingers", nargs=2, default=["touch1.shape", "touch2.shape"], metavar="NODE",
-        help="estimate of each finger (default touch1.shape touch2.shape)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--modules", nargs=2, default=["left", "right"], metavar="NODE",
-        help="axes x, y, th of each module (default left right)",
-    )  # fmt: skip
-    parser.add_argument(
-        "--wrists", nargs="*", default=["wrist1", "wrist2"], metavar="NODE",
-        help="force sensor of each wrist, none without a name (default wrist1 wrist2)",
-    )  # fmt: skip
+    add_hand(parser)
+    add_beside(parser)
 
 
 def run(args: argparse.Namespace) -> int:
@@ -67,7 +62,17 @@ def run(args: argparse.Namespace) -> int:
         ValueError: no object, a file that is there, or one that cannot be continued.
         OSError: a node that is not there, or a hand that was stopped.
     """
-    from sioms.hand.survey import BAR, DISK, Thing, settings
+    from sioms.hand.survey import (
+        BAR,
+        DISK,
+        LOADS_N,
+        SLIPS_N,
+        Thing,
+        continued,
+        next_grasp,
+        settings,
+        text_of,
+    )
     from sioms.hand.touch import Failed
     from sioms.whole_file import write_whole
 
@@ -75,14 +80,16 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError("record grasps: nothing is said of the object; want --disk RADIUS or --bar WIDTH")
     if len(args.wrists) not in (0, 2):
         raise ValueError(f"record grasps: {len(args.wrists)} wrists; want two, or --wrists without a name")
+    if args.slips and (args.bar is None or not (args.wrists or args.plane)):
+        raise ValueError("record slips: want --bar WIDTH, clamped to the platen, and both --wrists")
     if args.hidden is not None and not args.plane:
         raise ValueError("record grasps: --hidden is for a simulated hand; want --plane with it")
     thing = Thing(DISK, args.disk, args.thing) if args.bar is None else Thing(BAR, args.bar, args.thing)
     past = earlier(args.output, args.append)
-    plan = settings(args.grasps, args.forces, seed=args.seed)
+    plan = settings(args.grasps, args.forces or (SLIPS_N if args.slips else LOADS_N), seed=args.seed)
     surveys: list[Survey] = []
     try:
-        (_in_plane if args.plane else _in_cell)(args, thing, plan, int(past[-1][1]) + 1 if past else 0, surveys)
+        (_in_plane if args.plane else _in_cell)(args, thing, plan, next_grasp(past), surveys)
     except (Failed, OSError, KeyboardInterrupt) as failed:
         if not (surveys and surveys[0].rows) and not isinstance(failed, Failed):
             raise
@@ -91,18 +98,10 @@ def run(args: argparse.Namespace) -> int:
     for event in surveys[0].events if surveys else []:
         print(f"{event.time_s:8.2f} s  {event.text}", file=sys.stderr)
     if rows:
-        began = past[-1][0] if past else 0.0
-        write_whole(args.output, text(past + [[row[0] + began, *row[1:]] for row in rows]))
+        write_whole(args.output, text_of(continued(past, rows)))
     grasps = len({row[1] for row in rows})
     print(f"{grasps} of {len(plan)} grasps recorded, {len(rows)} rows: {args.output}")
     return 0 if grasps == len(plan) else 1
-
-
-def text(rows: Sequence[Sequence[float]]) -> str:
-    """Return a recording as CSV."""
-    from sioms.hand.survey import text_of
-
-    return text_of(rows)
 
 
 def earlier(path: Path, append: bool) -> list[list[float]]:
@@ -134,9 +133,13 @@ def _in_plane(
 
     mounts, turned = hidden(args.hidden)
     outline = disk(thing.size_m) if thing.kind == DISK else rectangle(thing.size_m, 0.08, 2e-3)
-    hand = PlaneHand(Body(outline), (1e-3, -2e-3, 0.02), Rig(turned_rad=turned), mounts, args.seed)
-    surveys.append(Survey(hand.hand, hand.reading, thing))
-    hand.run(surveys[0].carry_out(plan, hand.beside, first), MOST_S)
+    body, pose = Body(outline), (1e-3, -2e-3, 0.02)
+    if args.slips:
+        body, pose = Body(outline, CLAMPED_KG, CLAMPED), (1e-3, -2e-3, 0.0)
+    hand = PlaneHand(body, pose, Rig(turned_rad=turned), mounts, args.seed)
+    survey = Survey(hand.hand, hand.reading, thing)
+    surveys.append(survey)
+    hand.run((survey.slide if args.slips else survey.carry_out)(plan, hand.beside, first), MOST_S)
 
 
 def hidden(path: Path | None) -> tuple[Any, tuple[float, float]]:
@@ -173,14 +176,9 @@ def _in_cell(
 ) -> None:
     """Survey with the hand of a running workcell."""
     from sioms.client.workcell import Workcell
-    from sioms.hand.live.beside import Beside
-    from sioms.hand.live.cell import MANNER, CellHand
-    from sioms.hand.survey import Survey
+    from sioms.hand.live.surveying import Nodes, surveying
 
-    with (
-        Workcell(name="hand") as cell,
-        Beside(cell, args.modules, args.wrists) as beside,
-        CellHand(cell, args.node, args.fingers) as hand,
-    ):
-        surveys.append(Survey(hand.hand, hand.reading, thing, MANNER))
-        hand.run(surveys[0].carry_out(plan, beside.read, first), MOST_S)
+    nodes = Nodes(args.node, tuple(args.fingers), tuple(args.modules), tuple(args.wrists))
+    with Workcell(name="hand") as cell, surveying(cell, nodes, thing, args.slips) as (survey, carry):
+        surveys.append(survey)
+        carry(plan, first)

@@ -14,6 +14,7 @@ from importlib import import_module
 from typing import Any, Protocol, TypeVar
 
 from sioms.arguments import positive
+from sioms.hand.command.arguments import add_hand
 from sioms.hand.kinematics import Hand
 from sioms.hand.touch import Event, Failed, Manner, Reading, Sensed, Setpoint
 
@@ -33,11 +34,7 @@ class AnyHand(Protocol):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments, which all skills share."""
-    parser.add_argument("--node", default="hand", metavar="NAME", help="the hand's node (default hand)")
-    parser.add_argument(
-        "--fingers", nargs=2, default=["touch1.shape", "touch2.shape"], metavar="NODE",
-        help="estimate of each finger (default touch1.shape touch2.shape)",
-    )  # fmt: skip
+    add_hand(parser)
     parser.add_argument(
         "--force", type=positive, default=1.0, metavar="N", help="internal force in newtons (default 1)"
     )
@@ -62,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     if not 0.0 < args.time < math.inf:
         raise ValueError(f"hold for {args.time:g} s; want above 0, finite")
     with Workcell(name="hand") as cell, CellHand(cell, args.node, args.fingers) as hand:
-        manner = manner_of(MANNER, args.force)
+        manner = manner_of(hand.manner, args.force)
         found = carry_out(hand, args.hand_command, manner, args.time, lambda event: print(told(event), file=sys.stderr))
     for line in lines(found) if found is not None else []:
         print(line)

@@ -1,4 +1,7 @@
-"""What a running workcell tells of a hand beside its readings: commanded joints, and forces at the wrists."""
+"""What the devices of a hand tell by themselves, uncorrected: joints as the encoders read them, commands, wrists.
+
+The hand's own coordinates are behind the springs that it knows of; what is to show those springs must not be.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,7 @@ from contextlib import ExitStack
 from typing import Any, Self
 
 from sioms.client.workcell import Workcell
+from sioms.hand.touch import Felt
 
 JOINTS = 3  # of a module: x, y, th
 UNKNOWN = (math.nan, math.nan)
@@ -42,15 +46,21 @@ class Beside:
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def read(self) -> list[float]:
-        """Return x1, y1, th1, x2, y2, th2 as commanded [m, rad] and fx1, fy1, fx2, fy2 [N]; nan where not known."""
-        out: list[float] = []
+    def read(self, fingers: Sequence[Felt]) -> list[float]:
+        """Return a row of a survey, nan where not known (``sioms.hand.survey.Told``).
+
+        Args:
+            fingers: as they told it, of the same instant.
+        """
+        joints, commands, forces = list[float](), list[float](), list[float]()
         for node in self._modules:
             shown = node.read()
-            out += [at + behind for at, behind in zip(shown.position, shown.following_error, strict=True)]
+            joints += shown.position
+            commands += [at + behind for at, behind in zip(shown.position, shown.following_error, strict=True)]
         for node in self._wrists:
-            out += _forces(node.read())
-        return out if self._wrists else [*out, *UNKNOWN, *UNKNOWN]
+            forces += _forces(node.read())
+        felt = [*(finger.phi for finger in fingers), *(finger.force for finger in fingers)]
+        return [float(v) for v in (*joints, *felt, *commands, *(forces or (*UNKNOWN, *UNKNOWN)))]
 
 
 def _forces(shown: Any) -> Sequence[float]:

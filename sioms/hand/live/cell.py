@@ -15,15 +15,17 @@ import errno
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from typing import Any, Self, TypeVar
 
 from sioms.client.node import AxisNode
 from sioms.client.stream import Stream
 from sioms.client.workcell import Workcell
 from sioms.hand.control import Gains
-from sioms.hand.felt import felt, internal_force
+from sioms.hand.felt import felt, internal_force, no_shape
 from sioms.hand.follow import Follower, Order, standing
 from sioms.hand.kinematics import Hand, Six
+from sioms.hand.model import HandModel
 from sioms.hand.running import carried_out
 from sioms.hand.touch import Failed, Felt, Manner, Reading, Setpoint
 from sioms.protocol.flags import ControlMode, NodeClass
@@ -52,37 +54,44 @@ class CellHand:
         cell: the session.
         name: of the hand's node.
         fingers: nodes of what each finger feels.
-        hand: its modules.
         gains: of the laws, in the hand's time; the damper's are the driver's own.
         length_m: of the contact along a finger.
         lease_s: of the hand's node, in the hand's time.
 
     Attributes:
         pace: of the hand's time.
+        model: what the hand is known to be, as its node ``model`` shows it.
         reading: the last one, in the hand's time.
+        told: what each finger told for it, not corrected by the model.
         manner: how skills do it here.
         seen: called with every reading and the set-point that answered it.
 
     Raises:
-        OSError: a node that cannot be opened or read; ETIME, the cell's loops fall behind on this machine, and nothing
-            has moved.
+        OSError: a node that cannot be opened or read; EINVAL, one that is no shape of a calibrated finger; ETIME, the
+            cell's loops fall behind on this machine, and nothing has moved.
 
     Concurrency: one thread.
     """
 
     def __init__(
-        self, cell: Workcell, name: str = "hand", fingers: Sequence[str] = FINGERS, *, hand: Hand = Hand(),  # noqa: B008
+        self, cell: Workcell, name: str = "hand", fingers: Sequence[str] = FINGERS, *,
         gains: Gains = Gains(), length_m: float = 20e-3, lease_s: float = LEASE_S,  # noqa: B008
     ) -> None:  # fmt: skip
-        self.hand, self.manner, self._length_m = hand, MANNER, length_m
+        self._length_m = length_m
         self.pace = _watched(cell, f"{name}.force", fingers)
+        self.model = _known(cell, f"{name}.model")
+        self.hand: Hand = self.model.maps()
+        self.manner = replace(MANNER, friction=min(MANNER.friction, self.model.friction))
         self._follower = Follower(gains)
         self.seen: Callable[[Reading, Setpoint], None] | None = None
         with ExitStack() as stack:
             self._node: AxisNode = stack.enter_context(cell.open(name, "rw", 10.0, lease=lease_s / self.pace))
             self._fingers: list[Any] = [stack.enter_context(cell.open(f"{node}")) for node in fingers]
+            for node in self._fingers:
+                if why := no_shape(node.name, [channel.name for channel in node.info.channels]):
+                    raise OSError(errno.EINVAL, f"take the hand: {why}")
             self._stream = Stream(self._node, ahead=8)
-            self._felt, self._stamps_ns = [_BLIND, _BLIND], [0, 0]
+            self.told, self._stamps_ns = [_BLIND, _BLIND], [0, 0]
             self._number, self._time_s = 0, 0.0
             self._begin_ns = time.monotonic_ns()
             self.reading = self._read()
@@ -165,9 +174,19 @@ class CellHand:
             except OSError:  # it is told by the age of its last frame
                 continue
             self._stamps_ns[i] = frame.stamp_ns
-            self._felt[i] = felt(frame.data, self._length_m)
+            self.told[i] = felt(frame.data, self._length_m)
         ages = [max((now_ns - stamp_ns) * pace_s, 0.0) for stamp_ns in self._stamps_ns]
-        return Reading(time_s, self.hand.inverse(self._at), (self._felt[0], self._felt[1]), (ages[0], ages[1]))
+        one, two = (self.model.corrected(felt, i) for i, felt in enumerate(self.told))
+        return Reading(time_s, self.hand.inverse(self._at), (one, two), (ages[0], ages[1]))
+
+
+def _known(cell: Workcell, name: str) -> HandModel:
+    """Return the model that a hand shows."""
+    with cell.open(name) as node:
+        shown: Any = node.wait_new(0, _FIRST_S)
+        told = [float(shown.measured(i)) for i in range(9)]
+    link, mount, stiffness, gain = ((told[i], told[i + 1]) for i in range(0, 8, 2))
+    return HandModel(link, mount, stiffness, gain, told[8])
 
 
 def _watched(cell: Workcell, force: str, fingers: Sequence[str]) -> float:

@@ -41,7 +41,8 @@ class HandBelief:
         soft_load, soft: approach of finger and a flat [m] at line loads [N/m], rising from 0, 0.
         length: of the contact along a finger [m]; pitch: angle between elements of a finger [rad].
         bend, coefficient: coefficient of friction over 1/R of the contact [1/m].
-        level, power: relative departure of it, and the power of the load in newtons that it goes with.
+        level, power, bow: relative departure of it, the power of the load in newtons that it goes with, and by which
+            share of itself that power changes with the load's logarithm.
         responses: further changes with their parameters, in order.
     """
 
@@ -60,6 +61,7 @@ class HandBelief:
     coefficient: Floats
     level: float = 0.0
     power: float = 0.0
+    bow: float = 0.0
     responses: tuple[tuple[Response, Floats], ...] = field(default=())
 
     def responding(self, response: Response, parameters: Floats) -> HandBelief:
@@ -212,7 +214,8 @@ def line_of(g: Grasps, contact: Floats, n: Floats) -> Floats:
 def friction(b: HandBelief, press: Floats, bend: Floats) -> Floats:
     """Return the coefficient of friction at normal forces [N] and 1/R [1/m], shape (n,)."""
     table = np.interp(bend, b.bend, b.coefficient)
-    return np.asarray(table * (1.0 + b.level) * np.maximum(press, 1e-6) ** b.power)
+    size = np.log(np.maximum(press, 1e-6))
+    return np.asarray(table * (1.0 + b.level) * np.exp(b.power * (1.0 + b.bow * size) * size))
 
 
 def gaps(b: HandBelief, g: Grasps, axis: Floats | None = None, stray: Floats | None = None) -> Gaps:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from sioms.hand.command import record
+from sioms.hand.live.beside import Beside
 from sioms.hand.plane import PlaneHand, Rig
-from sioms.hand.survey import COLUMNS, DISK, PHI, PSI, Survey, Thing, rows_of, settings, text_of
-from sioms.hand.touch import Manner
-from sioms.plant.outline import disk
+from sioms.hand.survey import BAR, COLUMNS, DISK, PHI, PSI, Survey, Thing, rows_of, settings, text_of
+from sioms.hand.touch import Felt, Manner
+from sioms.plant.outline import disk, rectangle
 from sioms.plant.planar import Body, Mount
 from sioms.reconcile.files import hand as reconciled
 
@@ -67,10 +71,50 @@ def test_a_survey_records_grasps_that_close_on_the_object(tmp_path: Path) -> Non
     assert np.max(np.abs(found.drive)) < 0.02 and np.max(np.abs(found.wrist)) < 0.05
 
 
+def test_fingers_that_are_dragged_along_a_clamped_bar_tell_friction_under_each_load(tmp_path: Path) -> None:
+    """What is hidden is a coefficient that falls with the load; flat contacts have 2.0 by Table 4.2."""
+    mount = Mount(friction_by_load=((0.4, 1.0), (1.2, 0.6)))
+    body = Body(rectangle(0.03, 0.08, 2e-3), record.CLAMPED_KG, record.CLAMPED)
+    hand = PlaneHand(body, (1e-3, -2e-3, 0.0), Rig(every=4, compiled=False), mount, seed=1)
+    survey = Survey(hand.hand, hand.reading, Thing(BAR, 0.03), Manner(frames=10))
+    assert hand.run(survey.slide(settings(1, (0.4, 1.2)), hand.beside)) == 1
+    assert hand.world.pose == pytest.approx([1e-3, -2e-3, 0.0], abs=1e-5)
+    (tmp_path / "a.csv").write_text(text_of(survey.rows))
+    read = reconciled.read_grasps(tmp_path / "a.csv")
+    assert read.slip.tolist() == [1, 2, 1, 2]
+    normal, shear = np.abs(read.wrist[..., 0]), np.abs(read.wrist[..., 1])
+    hidden = 2.0 * np.interp(normal, [0.4, 1.2], [1.0, 0.6])
+    assert shear / normal == pytest.approx(hidden, rel=0.03)
+
+
+def test_a_cell_records_what_encoders_read_and_not_where_the_hand_knows_its_joints_to_be() -> None:
+    """The hand knows of springs behind its encoders: joints that are corrected by them hide how stiff they are."""
+
+    class Module:
+        name = "left"
+
+        def read(self) -> Any:
+            return SimpleNamespace(position=(0.1, 0.2, 0.3), following_error=(0.01, 0.0, -0.2))
+
+    class Cell:
+        def open(self, name: str) -> Any:
+            return contextlib.nullcontext(Module())
+
+    cell: Any = Cell()
+    felt = [Felt(True, 1.5, 0.0, 0.9), Felt(True, 1.6, 0.0, 1.1)]
+    with Beside(cell, ("left", "right"), ()) as beside:
+        row = beside.read(felt)
+    module = [0.1, 0.2, 0.3]
+    assert row[:6] == module * 2 and row[6:10] == [1.5, 1.6, 0.9, 1.1]
+    assert row[10:16] == pytest.approx([0.11, 0.2, 0.1] * 2) and all(map(math.isnan, row[16:]))
+
+
 @pytest.mark.parametrize(("text", "said"), [
     ("[finger3]\nlink_m = 0.14\n", "nobody reads finger3"),
     ("[finger1]\nlinks = 0.14\n", "unexpected keyword argument 'links'"),
     ("[finger1]\nlink_m = -1.0\n", "link_m is -1.0"),
+    ("[finger1]\nfriction_by_load = [[1.0, 1.0], [0.5, 2.0]]\n", "want forces that rise"),
+    ("[finger1]\nfriction_by_load = [[1.0, -1.0]]\n", "a factor of 0 or more"),
 ])  # fmt: skip
 def test_what_a_simulated_hand_hides_is_checked(tmp_path: Path, text: str, said: str) -> None:
     (tmp_path / "h.toml").write_text(text)

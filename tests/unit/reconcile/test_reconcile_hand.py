@@ -92,8 +92,10 @@ def test_wrists_and_loads_give_the_same_torques() -> None:
 def test_friction_follows_the_table_and_the_load() -> None:
     b: HandBelief = RIGID.base
     assert friction(b, np.array([0.5, 3.0]), np.full(2, 1 / 12.7e-3)) == pytest.approx([2.0, 2.0])
-    powered = library()["friction_load"].change(b, {"m": np.array([-0.5])})
+    powered = library()["friction_load"].change(b, {"m": np.array([-0.5]), "c": np.array([0.0])})
     assert friction(powered, np.array([1.0, 4.0]), np.full(2, 1 / 12.7e-3)) == pytest.approx([2.0, 1.0])
+    bowed = library()["friction_load"].change(b, {"m": np.array([-0.5]), "c": np.array([-1.0 / np.log(4.0)])})
+    assert friction(bowed, np.array([1.0, 4.0]), np.full(2, 1 / 12.7e-3)) == pytest.approx([2.0, 2.0])
 
 
 @pytest.mark.parametrize("plan", CATALOGUE, ids=lambda plan: plan.name)

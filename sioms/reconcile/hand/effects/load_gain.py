@@ -5,24 +5,19 @@ from __future__ import annotations
 from operator import add
 
 from sioms.reconcile.effect import Channel
-from sioms.reconcile.hand.effects.pairs import FINGERS, changed, of_both
-from sioms.reconcile.sensors.effect import Quantity, SensorEffect
+from sioms.reconcile.hand.effects.pairs import both
+from sioms.reconcile.sensors.effect import Quantity
 
-
-def of_finger(finger: int) -> SensorEffect:
-    """Return the effect of one finger."""
-    other = of_both("load_gain")[2 - finger]
-    return SensorEffect(
-        name=f"load_gain_{finger}",
-        title=f"scale of the load that finger {finger} tells",
-        channel=Channel.SENSOR,
-        change=changed("gain", finger, add, "g"),
-        equation=f"told load_{finger} = (1 + g) load_{finger}",
-        parameters=(Quantity("g", "1", -0.8, 4.0, 0.1, "relative departure of the load"),),
-        signature="loads that differ from those of the wrist, or of the other finger, in proportion",
-        lookalikes=(f"drive_stiffness_{finger}", f"joint_stiffness_{finger}", other),
-        separate="the wrists' forces recorded with the loads",
-    )
-
-
-EFFECTS = tuple(of_finger(finger) for finger in FINGERS)
+EFFECTS = both(
+    "load_gain",
+    Channel.SENSOR,
+    "gain",
+    add,
+    Quantity("g", "1", -0.8, 4.0, 0.1, "relative departure of the load"),
+    title="scale of the load that finger {n} tells",
+    equation="told load_{n} = (1 + g) load_{n}",
+    signature="loads that differ from those of the wrist, or of the other finger, in proportion",
+    separate="the wrists' forces recorded with the loads",
+    alike=("load_gain",),
+    alike_there=("drive_stiffness", "joint_stiffness"),
+)
