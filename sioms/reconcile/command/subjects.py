@@ -266,9 +266,38 @@ def _write_force(args: Args, verdict: Any) -> None:
 
 
 def _hand_arguments(parser: argparse.ArgumentParser) -> Any:
-    parser.add_argument("data", type=Path, metavar="DATA", help="file or folder of recorded grasps")
+    from sioms.hand.command.arguments import add_beside, add_fingers
+
+    parser.add_argument(
+        "data", type=Path, metavar="DATA", help="file or folder of recorded grasps, or the node of a hand"
+    )
     parser.add_argument("--model", type=Path, metavar="FILE", required=True, help="nominal hand (TOML)")
-    return None
+    group = parser.add_argument_group("with a node")
+    group.add_argument(
+        "--disks", type=positive, nargs="+", default=[], metavar="R",
+        help="radii in m of the disks at hand; the first object lies between the fingers, the others are requested",
+    )  # fmt: skip
+    group.add_argument(
+        "--bars", type=positive, nargs="+", default=[], metavar="W", help="widths in m of the bars at hand"
+    )
+    group.add_argument(
+        "--clamped",
+        type=positive,
+        default=0.0,
+        metavar="W",
+        help="width in m of a bar that can be clamped",
+    )
+    group.add_argument("--grasps", type=whole(1), default=12, metavar="N", help="number of grasps of each object (12)")
+    group.add_argument("--first", choices=("full", "one_object"), default="full", help="objects to grasp first")
+    add_fingers(group)
+    add_beside(group)
+    group.add_argument(
+        "--install",
+        type=Path,
+        metavar="FILE",
+        help="write what the hand is known to be to FILE, the model_file of its driver, and reload",
+    )
+    return group
 
 
 def _analyse_hand(args: Args, say: Say) -> Any:
@@ -277,11 +306,30 @@ def _analyse_hand(args: Args, say: Say) -> Any:
     return reconcile_hand(args.data, args.model, args.seed, say)
 
 
+def _live_hand(args: Args, folder: Path, say: Say) -> tuple[Any, float]:
+    from sioms.hand.live.surveying import Nodes
+    from sioms.reconcile.live.hand import Grasping, live
+
+    nodes = Nodes(str(args.data), tuple(args.fingers), tuple(args.modules), tuple(args.wrists))
+    objects = tuple(args.disks), tuple(args.bars), args.clamped, args.grasps
+    asked = Grasping(nodes, *objects, args.first == "full", args.yes, args.socket, args.seed)
+    return live(args.model, asked, folder, say)
+
+
 def _write_hand(args: Args, verdict: Any) -> None:
-    from sioms.reconcile.files.hand import read_model
+    from sioms.hand import model
+    from sioms.reconcile.files.hand import known, read_model
     from sioms.reconcile.hand.model_file import to_toml
 
     write_whole(args.out / "model.toml", to_toml(verdict.model, read_model(args.model)[1]))
+    write_whole(args.out / "hand.toml", model.to_toml(known(verdict.model)))
+
+
+def _install_hand(args: Args, verdict: Any) -> str:
+    from sioms.reconcile.live.experiments import install, reload
+
+    text = (args.out / "hand.toml").read_text(encoding="utf-8")
+    return install(text, args.install, args.socket, "what the hand is known to be", reload)
 
 
 SUBJECTS = {
@@ -313,11 +361,12 @@ SUBJECTS = {
         "what pressed is clear or halted",
     ),
     "hand": Subject(
-        "a two-fingered hand, from recorded grasps",
+        "a two-fingered hand, from recorded grasps or live",
         _hand_arguments,
         _analyse_hand,
-        None,
+        _live_hand,
         _write_hand,
-        None,
+        _install_hand,
+        "the hand stands",
     ),
 }

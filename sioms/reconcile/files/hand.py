@@ -21,10 +21,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.hand.model import HandModel
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.contents import contents
 from sioms.reconcile.files.table import SUFFIXES, load_columns
 from sioms.reconcile.given import parsed
+from sioms.reconcile.hand.belief import HandBelief, friction
 from sioms.reconcile.hand.grasps import Floats, Grasps
 from sioms.reconcile.hand.model_file import Noise, from_table
 from sioms.reconcile.sensors.effect import SensorModel
@@ -33,6 +35,7 @@ from sioms.reconcile.sensors.verdict import SensorVerdict
 JOINTS = tuple(f"{joint}{finger}" for finger in (1, 2) for joint in ("x", "y", "th"))
 COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
 PLACES, LOADS = ("place1", "place2"), ("load1", "load2")
+GRASPS_N = (0.2, 4.0)
 WRISTS = ("fx1", "fy1", "fx2", "fy2")
 NEEDED = ("time", "grasp", "kind", "thing", "size", *JOINTS, *PLACES, *LOADS)
 COLUMNS = (*NEEDED, *COMMANDS, *WRISTS, "slip")
@@ -127,3 +130,12 @@ def grasps_of(table: Mapping[str, Floats], name: str, record: int) -> Grasps:
         thing=whole("thing"), size=table["size"], command=of(COMMANDS), joints=of(JOINTS), place=of(PLACES),
         load=of(LOADS), wrist=of(WRISTS).reshape(-1, 2, 2), slip=whole("slip"),
     )  # fmt: skip
+
+
+def known(model: SensorModel) -> HandModel:
+    """Return what a hand is known to be, for its driver: the least friction is that of the loads of grasps."""
+    b: HandBelief = model.belief()
+    loads = np.linspace(*GRASPS_N, 20)
+    least = min(float(friction(b, loads, np.full(len(loads), bend)).min()) for bend in b.bend)
+    link, mount, joint, gain = ((float(pair[0]), float(pair[1])) for pair in (b.link, b.mount, b.joint, b.gain))
+    return HandModel(link, mount, joint, gain, least)
