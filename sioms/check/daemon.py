@@ -33,13 +33,15 @@ class Daemon:
     Args:
         config: the configuration, TOML.
         pin: core that the daemon and its drivers may use, None for all.
+        ready_s: how long it may take until it is ready.
 
     Attributes:
         pid, socket: of the daemon.
         start_ns, ready_ns: when it was started, and when it told that it was ready [CLOCK_MONOTONIC].
     """
 
-    def __init__(self, config: str, pin: int | None = None) -> None:
+    def __init__(self, config: str, pin: int | None = None, ready_s: float = READY_S) -> None:
+        self._ready_s = ready_s
         self.folder = Path(tempfile.mkdtemp(prefix="sioms-bench-"))
         self.socket = str(self.folder / "siomsd.sock")
         self.log_path = self.folder / "log"
@@ -85,13 +87,13 @@ class Daemon:
         self.ready_ns = time.monotonic_ns()
 
     def _wait_ready(self, notify: socket.socket) -> None:
-        while time.monotonic_ns() - self.start_ns < READY_S * 1e9 and self.process.poll() is None:
+        while time.monotonic_ns() - self.start_ns < self._ready_s * 1e9 and self.process.poll() is None:
             try:
                 if b"READY=1" in notify.recv(4096):
                     return
             except TimeoutError:
                 continue
-        raise RuntimeError(f"start daemon: not ready; want READY=1 within {READY_S:g} s; it said:\n{self.log()}")
+        raise RuntimeError(f"start daemon: not ready; want READY=1 within {self._ready_s:g} s; it said:\n{self.log()}")
 
     def __enter__(self) -> Self:
         return self
