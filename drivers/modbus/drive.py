@@ -25,6 +25,8 @@ from .guard import Guard
 from .unit import MappedUnit, Values
 
 SELDOM_NS = 1_000_000_000
+SEARCH_RESTS_NS = 3_000_000_000
+"""How long a drive may stand in the middle of a search for its reference."""
 REST_S = 5.0
 """Longest time that a drive may take to come to rest when it is opened [s]."""
 LOOKS_AT_REST = 10
@@ -79,6 +81,8 @@ class DriveUnit(LineUnit):
         self._alarm = 0
         self._homes = False
         self._homed: bool | None = None
+        self._moved_ns = 0
+        """When it moved last, or did not home [ns]."""
         self._runs = self._lost = False
         self._polled_ns = 0
         self._epoch = 0
@@ -122,6 +126,7 @@ class DriveUnit(LineUnit):
         moving, done = self._motion(values)
         self._position = float(values[self._axis.position])
         self._look_at_place(values, now_ns)
+        self._look_at_search(moving, now_ns)
         self.bank.poll(
             now_ns,
             np.array([self._position]),
@@ -195,6 +200,15 @@ class DriveUnit(LineUnit):
             self._lose_place(self._mapped.alarm_text(self._alarm))
         if "homed" in self._axis.status and not self._homes:
             self._note_reference(self._bit(values, "homed"), now_ns)
+
+    def _look_at_search(self, moving: bool, now_ns: int) -> None:
+        """End a homing that was broken off, by another master: the drive stands for long, and knows no reference."""
+        if not self._homes or moving:
+            self._moved_ns = now_ns
+        elif now_ns - self._moved_ns > SEARCH_RESTS_NS:
+            self._homes = False
+            text = "the homing was broken off, and found no reference; RESET, then HOME again"
+            self.bank.break_off([0], f"{self.name}: {text}", now_ns)
 
     def _end_before_soft_limit(self, now_ns: int) -> None:
         """Stop a velocity before it passes a soft limit."""

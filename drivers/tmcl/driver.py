@@ -53,6 +53,8 @@ EXTENDED_FAULTS = {1: "motor stalled", 2: "deviation from the encoder too large"
 FAULT_BITS = {Axis.DRIVER_ERRORS: DRIVER_FAULTS, Axis.EXTENDED_ERRORS: EXTENDED_FAULTS}
 SURE = 0.8
 """Share of the heartbeat from which on the module may have been silent for all of it."""
+NEAR_ZERO = 16
+"""Microsteps within which a module has just been set to count from 0."""
 SELDOM_NS = 500_000_000
 PAD_S = 0.01
 """How long after a single byte, beside the time of the characters, the module has to say that it was the ninth."""
@@ -197,6 +199,8 @@ class TmclUnit(AxesUnit):
         self._turn = 0
         self._lost = ""
         self._homes = [False] * len(self._motors)
+        self._counted = [False] * len(self._motors)
+        """Whether the module has counted something else than 0 since a search was asked for."""
         self._faults = [""] * len(self._motors)
         self._without: set[int] = set()
         self._seldom_ns = 0
@@ -273,9 +277,11 @@ class TmclUnit(AxesUnit):
             velocity[axis] = speed / (scale.per_speed * scale.per_unit)
             moving[axis], done[axis] = speed != 0, bool(reached)
             if self._homes[axis]:
-                moving[axis], done[axis] = searches, not searches
-                self._homes[axis] = searches
-                done[axis] &= not (yield from self._breaks_off(axis))
+                self._counted[axis] |= abs(steps) > NEAR_ZERO
+                self._homes[axis] = moving[axis] = searches or speed != 0
+                done[axis] = (
+                    not moving[axis] and not (yield from self._breaks_off(axis)) and self._has_found(axis, steps)
+                )
         if self.clock() >= self._seldom_ns:
             self._seldom_ns = self.clock() + SELDOM_NS
             yield from self._read_faults()
@@ -306,8 +312,21 @@ class TmclUnit(AxesUnit):
 
     def home(self, axis: int) -> Steps:
         """Begin the module's reference search."""
-        yield from self._ask(self._module.exchange(Op.RFS, 0, self._motors[axis]))
-        self._homes[axis], self._silent_ns = True, 0
+        motor = self._motors[axis]
+        steps = yield from self._ask(self._module.get(Axis.ACTUAL_POSITION, motor))
+        yield from self._ask(self._module.exchange(Op.RFS, 0, motor))
+        self._homes[axis], self._silent_ns, self._counted[axis] = True, 0, abs(steps) > NEAR_ZERO
+
+    def _has_found(self, axis: int, steps: int) -> bool:
+        """Tell whether a search that is over has found its switch: the module then counts from 0 there.
+
+        Whoever else sends RFS STOP ends it as well, and the module has no flag that says so; the count goes on.
+        """
+        if abs(steps) <= NEAR_ZERO and self._counted[axis]:
+            return True
+        self.break_off(axis, f"the reference search was broken off, by another master: the module counts {steps}, "
+                             "and 0 where it has found its switch; RESET, then HOME again")  # fmt: skip
+        return False
 
     def _breaks_off(self, axis: int) -> Generator[Any, Any, bool]:
         """Break off a search during which the module has not been asked for as long as its heartbeat lasts; return
@@ -321,8 +340,8 @@ class TmclUnit(AxesUnit):
         self._homes[axis] = False
         with suppress(DeviceError):  # the fault below stops the motor as well
             yield from self._ask(self._module.exchange(Op.RFS, 1, self._motors[axis]), repeatable=True)
-        self.lose_place(axis, f"the reference search was broken off: nothing was asked for {silent_s:.3g} s, and after "
-                              f"{heartbeat_s:g} s the module stops its motors; home again")  # fmt: skip
+        self.break_off(axis, f"the reference search was broken off: nothing was asked for {silent_s:.3g} s, and after "
+                             f"{heartbeat_s:g} s the module stops its motors; home again")  # fmt: skip
         return True
 
     def reset(self, axis: int) -> Steps:

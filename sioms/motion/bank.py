@@ -286,6 +286,14 @@ class Bank(ABC):
             self.fault(fresh, text, now_ns)
             self._forget_places(fresh)
 
+    def break_off(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
+        """Put axes in fault whose search for a reference has ended without one, as ``lose_place``: again each time."""
+        chosen = np.asarray(axes, dtype=np.int64)
+        self.lose_place(chosen, text, now_ns)
+        searching = chosen[(self._queue.latched[chosen] & int(AxisStatus.HOMING)) != 0]
+        if searching.size:  # whose place was lost before
+            self.fault(searching, text, now_ns)
+
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""
         return self._queue.fault_text(axis)

@@ -255,6 +255,12 @@ class AxesUnit(LineUnit):
         """
         self.bank.lose_place([axis], f"{self.name}: {text}", self.clock())
 
+    def break_off(self, axis: int, text: str) -> None:
+        """Say that the drive's search for its reference has ended without one, whoever has ended it: the axis is in
+        fault, as by ``lose_place``, also where its place was lost before.
+        """
+        self.bank.break_off([axis], f"{self.name}: {text}", self.clock())
+
     def act(self, action: DriveAction) -> Steps:
         """Carry out what the bank wants; a stop makes void the starts that still wait for the line."""
         if action.kind is not ActionKind.RESET:

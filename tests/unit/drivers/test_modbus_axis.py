@@ -209,6 +209,28 @@ def test_homing(make: Callable[..., Rig]) -> None:
     assert rig.position == 0
 
 
+def test_a_homing_that_another_master_ends_is_no_home() -> None:
+    """The drive stands, without an alarm, and has no reference."""
+    rig = leadshine_rig()
+    rig.write(ControlMode.POSITION, position=0.05)
+    rig.until_idle()
+    for _ in range(2):  # the second time from a reference that it had
+        rig.bank.home([0], rig.bus.clock_ns())
+        rig.go(0.3)
+        assert rig.drive.homing
+        rig.drive.trigger(0x40)
+        rig.go(1.0)
+        assert rig.status & AxisStatus.HOMING, "it may go on"
+        rig.go(3.0)
+        assert rig.status & AxisStatus.POSITION_LOST and not rig.status & (AxisStatus.HOMED | AxisStatus.HOMING)
+        assert "the homing was broken off" in rig.bank.fault_text(0)
+        rig.bank.reset([0])
+        rig.go(0.3)
+    rig.bank.home([0], rig.bus.clock_ns())
+    rig.until_idle()
+    assert rig.status & AxisStatus.HOMED and not rig.status & AxisStatus.POSITION_LOST
+
+
 @RIGS
 def test_an_alarm_in_motion_is_told_by_name_and_reset(make: Callable[..., Rig]) -> None:
     rig = make()

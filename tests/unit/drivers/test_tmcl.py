@@ -283,6 +283,36 @@ def test_a_search_that_the_heartbeat_has_ended_is_no_homing(pause_s: float) -> N
     assert ("home again" in rig.unit.bank.fault_text(0)) == (pause_s > 0.5)
 
 
+def home(rig: Joined, phase: int | None) -> AxisStatus:
+    """Home, with an RFS STOP of another master in a phase of the search; return the status when it is over."""
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig._act()
+    for _ in range(400):
+        if phase in (0, rig.device.motors[0].searching):
+            rig.device._search(rig.device.motors[0], 1)
+        rig.poll()
+        if not rig.unit._homes[0]:
+            break
+    rig.poll(10)
+    assert not rig.device.motors[0].searching
+    return AxisStatus(int(rig.unit.bank.rows["status"][0]))
+
+
+@pytest.mark.parametrize("phase", [0, 1, 2, None])
+def test_a_search_that_another_master_ends_is_no_homing(phase: int | None) -> None:
+    """Nothing in the module says so but its count, which is 0 where it has found its switch."""
+    rig = opened({"axis": [{**AXIS, "homing": True}]})
+    rig.device.motors[0].parameters[194], rig.device.motors[0].mover.low = int(0.2 * PER_M), -500_000.0
+    for _ in range(2):  # the second time its place is lost already, or known
+        found = home(rig, phase)
+        assert (AxisStatus.HOMED in found) == (phase is None) != (AxisStatus.POSITION_LOST in found)
+        assert ("broken off, by another master" in rig.unit.bank.fault_text(0)) == (phase is not None)
+        assert AxisStatus.HOMING not in found
+        rig.unit.bank.reset([0])
+        rig.poll(10)
+    assert AxisStatus.HOMED in home(rig, None)
+
+
 def test_single_bytes_take_their_time_at_9600() -> None:
     table = {"axis": [AXIS], "line": {"serial": "/x", "baud": 9600}}
     rig = Joined(Tmcl, table, lambda clock: tmcl.Module(clock=clock))
