@@ -10,6 +10,7 @@ import random
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable
+from functools import lru_cache
 from typing import NamedTuple
 
 from ownership_cell import Cell, cells
@@ -142,9 +143,13 @@ def explore(way: Iterable[Action], depth: int, goes_on: Callable[[], bool] = lam
     return graph, first, reached
 
 
-def explore_all(way: Iterable[Action], requests: int) -> tuple[int, int]:
-    """Go through all states that can come about with so many requests, deaths and other events in all, in whatever
-    order they and what happens by itself come; return how many these are, and the steps between them.
+DEATHS = frozenset(["die", "kill", "crash"])
+"""Ends of a client, of a driver, of the daemon."""
+
+
+def explore_all(way: Iterable[Action], requests: int, deaths: int = 0) -> tuple[int, int]:
+    """Go through all states that can come about with so many requests, deaths and other events, and so many deaths
+    more, in whatever order they and what happens by itself come; return how many these are, and the steps between them.
 
     What happens by itself comes to rest without a request, so that there is an end.
 
@@ -153,30 +158,38 @@ def explore_all(way: Iterable[Action], requests: int) -> tuple[int, int]:
     """
     first = first_of(way)
     came: dict[State, tuple[State, Action] | None] = {first: None}
-    taken, done, count = {first: 0}, set[State](), 0
+    fronts = {(used, died): list[State]() for used in range(requests + 1) for died in range(deaths + 1)}
+    fronts[0, 0].append(first)
+    done: dict[State, list[tuple[int, int]]] = {}
     rests: set[State] = set()
-    front = [first]
-    for used in range(requests + 1):
-        new: list[State] = []
+    count = 0
+    for (used, died), front in sorted(fronts.items(), key=lambda item: (sum(item[0]), item[0])):
         while front:
             state = front.pop()
-            if state in done:
+            before = done.setdefault(state, [])
+            if any(u <= used and d <= died for u, d in before):
                 continue  # it was reached with less
-            done.add(state)
+            before.append((used, died))
             for action in actions(state):
-                by_itself = action[0] in SYSTEM
-                if not by_itself and used == requests:
+                cost = _cost(action, used, died, deaths)
+                if cost[0] > requests:
                     continue
                 after, _ = _after(state, action, came)
                 count += 1
-                alike, cost = typical(after), used + (not by_itself)
-                if alike not in taken:
+                alike = typical(after)
+                if alike not in came:
                     _see_rest(alike, rests)
-                if cost < taken.get(alike, requests + 1):
-                    came[alike], taken[alike] = (state, action), cost
-                    (front if by_itself else new).append(alike)
-        front = new
+                    came[alike] = (state, action)
+                if not any(u <= cost[0] and d <= cost[1] for u, d in done.get(alike, ())):
+                    fronts[cost].append(alike)
     return len(done), count
+
+
+def _cost(action: Action, used: int, died: int, deaths: int) -> tuple[int, int]:
+    """Return how many events, and deaths beside them, there have been after an action."""
+    if action[0] in SYSTEM:
+        return used, died
+    return (used, died + 1) if action[0] in DEATHS and died < deaths else (used + 1, died)
 
 
 def _after(state: State, action: Action, came: dict[State, tuple[State, Action] | None]) -> tuple[State, str]:
@@ -425,6 +438,7 @@ def renamed(s: State, clients: tuple[int, ...], devices: tuple[int, ...]) -> Sta
 ALIKE = [((*clients, GUEST), devices) for clients in ((0, 1), (1, 0)) for devices in ((0, 1), (1, 0))]
 
 
+@lru_cache(maxsize=1 << 18)
 def typical(s: State) -> State:
     """Return the one that stands for all states that differ from this one by names only."""
     return min(renamed(s, *names) for names in ALIKE)
@@ -435,18 +449,22 @@ def main(arguments: list[str]) -> int:
     parser = argparse.ArgumentParser(description="Explore the protocol of ownership and stops on the real objects.")
     parser.add_argument("--model-depth", type=int, default=0, help="steps from each beginning, in the model only")
     parser.add_argument("--requests", type=int, default=0, help="how many in all, to the end, in the model only")
+    parser.add_argument("--deaths", type=int, default=0, help="how many beside the requests")
+    parser.add_argument("--beginning", type=int, help="one of them; default all")
     parser.add_argument("--depth", type=int, default=0, help="steps from each beginning, taken by the real objects")
     parser.add_argument("--walks", type=int, default=0, help="random walks of 400 steps")
     parser.add_argument("--seed", type=int, default=0, help="of the first walk")
     options = parser.parse_args(arguments)
-    for name in BEGINNINGS:
+    chosen = list(BEGINNINGS) if options.beginning is None else [list(BEGINNINGS)[options.beginning]]
+    for name in chosen:
         if options.model_depth:
             graph, _, reached = explore(begin(name), options.model_depth)
             steps = sum(map(len, graph.values()))
             print(f"model, {name}: depth {reached}: {len(graph)} states, {steps} steps between them", flush=True)
         if options.requests:
-            states, steps = explore_all(begin(name), options.requests)
-            print(f"model, {name}: all of {options.requests} requests: {states} states, {steps} steps", flush=True)
+            states, steps = explore_all(begin(name), options.requests, options.deaths)
+            what = f"{options.requests} requests and {options.deaths} deaths"
+            print(f"model, {name}: all of {what}: {states} states, {steps} steps", flush=True)
         if options.depth:
             found = run(name, options.depth)
             print(

@@ -71,6 +71,11 @@ def test_no_promise_is_broken_by_all_that_one_event_can_bring_about(name: str) -
     assert steps > states > 50
 
 
+def test_no_promise_is_broken_by_one_event_and_a_death_at_any_step() -> None:
+    states, steps = explore_all(begin("nobody owns anything"), 1, 1)
+    assert steps > states > 800
+
+
 @pytest.mark.parametrize("name", BEGINNINGS)
 def test_the_real_objects_go_where_the_model_goes(name: str) -> None:
     found = run(name, DEPTH)

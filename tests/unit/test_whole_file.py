@@ -34,6 +34,15 @@ def test_what_cannot_be_written_leaves_what_was_there(tmp_path: Path) -> None:
     assert [each.name for each in tmp_path.iterdir()] == ["finger.toml"]
 
 
+def test_who_has_the_old_file_open_reads_all_of_it(tmp_path: Path) -> None:
+    """The new one takes its place; at no instant is there a file that is half of each."""
+    path = tmp_path / "finger.toml"
+    path.write_text("old")
+    with path.open() as reader:
+        write_whole(path, "new and longer")
+        assert reader.read() == "old" and path.read_text() == "new and longer"
+
+
 @pytest.mark.parametrize("there", [False, True])
 def test_a_starter_configuration_is_whole_or_not_there(tmp_path: Path, there: bool) -> None:
     path = tmp_path / "cell.toml"

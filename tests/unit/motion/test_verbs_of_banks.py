@@ -31,6 +31,7 @@ VERBS: dict[str, Verb] = {
     "let_go": lambda bank, now: bank.let_go([1]),
     "ends": lambda bank, now: bank.ends()[1:],
     "lose_place": lambda bank, now: bank.lose_place([0], "tried", now),
+    "break_off": lambda bank, now: bank.break_off([0], "tried", now),
     "fault_text": lambda bank, now: bank.fault_text(0),
     "check_reset": lambda bank, now: bank.check_reset([1], now),
     "reset": lambda bank, now: bank.reset([1]),

@@ -364,6 +364,24 @@ def test_what_a_killed_process_left_beside_the_file_is_not_written_to(tmp_path, 
     assert Kept(tmp_path / "x", axis(restore=ALWAYS)).rig.field("position") == pytest.approx(0.75)
 
 
+def test_what_somebody_puts_beside_the_file_meanwhile_is_not_written_to(tmp_path, monkeypatch):
+    """Between looking what a killed process has left and making the file."""
+    other, fresh, unlink = tmp_path / "other", tmp_path / "x.new", os.unlink
+    other.write_text("mine")
+
+    def unlink_and_put(path):
+        try:
+            unlink(path)
+        finally:
+            if str(path) == str(fresh) and not fresh.is_symlink():
+                fresh.symlink_to(other)
+
+    monkeypatch.setattr(os, "unlink", unlink_and_put)
+    with pytest.raises(FileExistsError):
+        Kept(tmp_path / "x", axis(restore=ALWAYS))
+    assert other.read_text() == "mine"
+
+
 def test_offsets_are_those_of_the_rule():
     entry = Entry(AT_REST, 0.5, 0.75)
     assert offset_of(entry, axis(restore=ALWAYS), 0.1) == (0.65, "")
