@@ -40,6 +40,8 @@ TWO_FILES = ("-n", "2", "--dist", "loadfile")
 """Two workers; what a file computes for all of its tests is computed once."""
 Step = tuple[str, list[str]]
 """Its name, and its command."""
+Result = tuple[Step, int, float]
+"""A step, its exit status, and how long it took [s]."""
 
 
 def static_checks() -> list[Step]:
@@ -71,7 +73,7 @@ def run_tests() -> int:
     """Run all checks and tests."""
     return run_steps(
         [of_processes(*BESIDE)] if BESIDE else [],
-        beside=[*static_checks(), documents(), computing(*PARALLEL)],
+        beside=[[*static_checks(), documents()], [computing(*PARALLEL)]],
         then=[(f"{folder}, one by one", pytest("alone", folder)) for folder in ALONE],
     )
 
@@ -98,25 +100,26 @@ def run_quick(arguments: list[str]) -> int:
     rest = [path for path in chosen if path not in apart]
     return run_steps(
         [of_processes(*apart)] if apart else [],
-        beside=[*static_checks(), *([computing(*rest)] if rest else [])],
+        beside=[static_checks(), [computing(*rest)] if rest else []],
     )
 
 
-def run_steps(steps: list[Step], *, beside: Sequence[Step] = (), then: Sequence[Step] = ()) -> int:
+def run_steps(steps: list[Step], *, beside: Sequence[Sequence[Step]] = (), then: Sequence[Step] = ()) -> int:
     """Run every step, also after a failure, and close with a table of them.
 
     Args:
         steps: run one after the other.
-        beside: at the same time, also one after the other, on the time of the processors that those leave.
+        beside: lanes that run at the same time, the steps of each also one after the other, on the time of the
+            processors that the first leave.
         then: after all these, with nothing beside them.
     """
     if steps:
         ALONE_AT_LAST.clear()
-    with ThreadPoolExecutor(1) as pool, ended_with_us():
-        waiting = pool.submit(lambda: [run_timed(step, beside=True) for step in beside if not ENDING.is_set()])
+    with ThreadPoolExecutor(len(beside) or 1) as pool, ended_with_us():
+        lanes = [pool.submit(run_lane, lane) for lane in beside]
         results = [run_timed(step) for step in steps]
         go_ahead()
-        results = [*waiting.result(), *results]
+        results = [*(result for lane in lanes for result in lane.result()), *results]
     results += [run_timed(step) for step in then]
     results = [run_again(result) for result in results]
     for step, code, seconds in results:
@@ -126,8 +129,13 @@ def run_steps(steps: list[Step], *, beside: Sequence[Step] = (), then: Sequence[
     return 0 if all(code == 0 or (is_pytest(step) and code == 5) for step, code, _ in results) else 1
 
 
-def run_timed(step: Step, *, beside: bool = False) -> tuple[Step, int, float]:
-    """Run a step; return it, its exit status, and how long it took [s]."""
+def run_lane(steps: Sequence[Step]) -> list[Result]:
+    """Run steps that give way to others, one after the other."""
+    return [run_timed(step, beside=True) for step in steps if not ENDING.is_set()]
+
+
+def run_timed(step: Step, *, beside: bool = False) -> Result:
+    """Run a step."""
     name, command = step
     say(f"{name}: {' '.join(command)}")
     began = time.monotonic()
@@ -139,7 +147,7 @@ def run_timed(step: Step, *, beside: bool = False) -> tuple[Step, int, float]:
     return step, code, time.monotonic() - began
 
 
-def run_again(result: tuple[Step, int, float]) -> tuple[Step, int, float]:
+def run_again(result: Result) -> Result:
     """Run what failed of tests once more, one by one.
 
     They time real processes: what the machine held up passes alone, what is wrong fails again.

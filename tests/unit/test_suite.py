@@ -64,7 +64,8 @@ def test_steps_beside_others_give_way_fail_the_run_and_are_shown_whole(tmp_path:
         "raise SystemExit(3)"  # gets on with its share, if it may, once the other has ended
     )
     steps = [("front", script(front))]
-    assert suite.run_steps(steps, beside=[("beside", script(beside))]) == 1
+    other = f"import os, time\nwhile not os.path.exists({str(mark)!r}): time.sleep(0.01)"  # a lane of its own
+    assert suite.run_steps(steps, beside=[[("other", script(other))], [("beside", script(beside))]]) == 1
     said = capfd.readouterr()
     assert "beside:\nTrue 19\n" in said.out
     assert "ok " in said.err and "FAILED" in said.err
@@ -82,7 +83,7 @@ def test_the_table_tells_what_a_step_has_used_with_what_it_has_started(capfd: An
 
 def test_a_command_that_is_not_there_fails_the_run_with_a_sentence(capfd: Any) -> None:
     there = ("there", script("print('done')"))
-    assert suite.run_steps([there], beside=[("style", ["/nowhere/ruff"]), there]) == 1
+    assert suite.run_steps([there], beside=[[("style", ["/nowhere/ruff"]), there]]) == 1
     said = capfd.readouterr()
     assert "style: run /nowhere/ruff: No such file or directory" in said.err and said.out.count("done") == 2
 
@@ -94,7 +95,7 @@ def test_who_ends_the_run_ends_what_runs_beside(tmp_path: Path, how: signal.Sign
         "import suite, sys\n"
         "wait = 'import os, sys, time; open(sys.argv[1], \"w\").write(str(os.getpid())); time.sleep(60)'\n"
         "steps = [('front', [sys.executable, '-c', 'import time; time.sleep(60)'])]\n"
-        "suite.run_steps(steps, beside=[('beside', [sys.executable, '-c', wait, sys.argv[1]])] * 2)\n"
+        "suite.run_steps(steps, beside=[[('beside', [sys.executable, '-c', wait, sys.argv[1]])] * 2] * 2)\n"
     )
     run = subprocess.Popen([*script(text), str(mark)], cwd=TREE / "tests", start_new_session=True)
     try:
