@@ -27,7 +27,8 @@ from sioms.protocol.flags import NodeClass
 from sioms.protocol.socketpath import cell_address
 
 from .client.cell_verbs import WorkcellVerbs
-from .client.channel import KEEPALIVE, Answer, Call, Channel, connect_channel
+from .client.channel import KEEPALIVE, Answer, Call, Channel
+from .client.connecting import connect_channel
 from .client.faces import Awaiting
 from .client.fleet_verbs import FleetMarkerVerbs, FleetVerbs
 from .client.node_core import S

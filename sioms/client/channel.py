@@ -10,30 +10,16 @@ from __future__ import annotations
 
 import errno
 import os
-from _socket import (
-    AF_UNIX,
-    CMSG_SPACE,
-    SCM_RIGHTS,
-    SHUT_RDWR,
-    SO_PEERCRED,
-    SO_RCVTIMEO,
-    SO_SNDTIMEO,
-    SOCK_SEQPACKET,
-    SOL_SOCKET,
-    socket,
-)
+from _socket import CMSG_SPACE, SCM_RIGHTS, SHUT_RDWR, SO_PEERCRED, SO_RCVTIMEO, SOL_SOCKET, socket
 from _thread import allocate_lock
-from stat import S_ISSOCK
 from struct import pack, unpack
-from sys import modules
 from time import monotonic
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply, encode, short_reply, value_of
-from sioms.protocol.socketpath import may_serve
 from sioms.protocol.verbs import Cancel, CancelOnHandle, Keepalive, Part
 
 from .arguments import checked, seconds
-from .shown import acknowledged_by_daemon, clock_acknowledged
+from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -49,7 +35,6 @@ if TYPE_CHECKING:
 _CMSG_CLOEXEC = 0x40000000
 _DONTWAIT = 0x40
 _ANCILLARY = CMSG_SPACE(8 * 4)
-_FOREVER = pack("ll", 0, 0)
 KEEPALIVE = Keepalive().packed()
 INTERRUPTIBLE_S = 1.0
 """A signal that comes just before the interpreter goes to sleep is seen when that wakes: it sleeps this long [s]."""
@@ -60,8 +45,6 @@ _STEP_S = 1 / 64
 """Steps in which the time-out of the socket is set [s]."""
 ENOUGH_LOOK_S = 0.25
 """The same for an answer that may be needless when it is overdue [s]."""
-CONNECT_S = 2.0
-"""How long a daemon may take to let a client in when many are waiting [s]; one that hangs lets nobody in."""
 
 
 class Call:
@@ -113,78 +96,6 @@ class Answer:
     def __init__(self, value: Any, fds: list[int]) -> None:
         self.value = value
         self.fds = fds
-
-
-def connect(path: str, timeout_s: float = CONNECT_S) -> socket:
-    """Connect to the daemon.
-
-    Raises:
-        OSError: nobody listens there, with a sentence that says how to start a daemon; ETIMEDOUT it lets nobody in.
-    """
-    sock = socket(AF_UNIX, SOCK_SEQPACKET)
-    try:
-        sock.setsockopt(SOL_SOCKET, SO_SNDTIMEO, pack("ll", int(timeout_s), int(timeout_s % 1 * 1e6)))
-        sock.connect(path)
-        sock.setsockopt(SOL_SOCKET, SO_SNDTIMEO, _FOREVER)
-    except BlockingIOError:
-        sock.close()
-        raise OSError(
-            errno.ETIMEDOUT,
-            f"connect to {path}: its queue is full and the daemon accepts nobody; is its process hung?",
-        ) from None
-    except OSError as error:
-        sock.close()
-        number = error.errno or errno.ENAMETOOLONG  # Python itself refuses a path that no address holds
-        hint = {
-            errno.ENOENT: "no daemon listens there; start one with `siomsd --config FILE`, or name its socket in "
-            "SIOMS_SOCKET",
-            errno.ECONNREFUSED: "the daemon that made this socket has ended; start one with `siomsd --config FILE`",
-            errno.EACCES: "no permission; ask to be put into the group of the socket",
-            errno.ENAMETOOLONG: "the path of a socket has at most 107 bytes",
-        }.get(number, os.strerror(number).lower())
-        if number == errno.ECONNREFUSED and not _is_socket(path):
-            hint = "that is not a socket; set SIOMS_SOCKET to the daemon's"
-        raise OSError(number, f"connect to {path}: {hint}") from None
-    uid = unpack("3i", sock.getsockopt(SOL_SOCKET, SO_PEERCRED, 12))[1]
-    if not may_serve(uid, path):
-        sock.close()
-        raise OSError(
-            errno.EPERM,
-            f"connect to {path}: user {uid} listens there, who is neither you nor root nor the owner of the folder; a "
-            "daemon for others has its socket in a folder of its own user, as /run/sioms",
-        )
-    return sock
-
-
-def connect_channel(address: str, timeout_s: float = CONNECT_S, *, waits: bool = True) -> Channel:
-    """Connect to the daemon at the path of its socket, or to a gateway, as ``zmq://HOST:PORT``.
-
-    Args:
-        address: of either.
-        timeout_s: how long that may take [s].
-        waits: whether threads of the program wait for answers, and not an event loop.
-
-    Raises:
-        OSError: with a sentence: nobody there, or one does not get in.
-    """
-    if "://" not in address:
-        return Channel(connect(address, timeout_s), "the daemon")
-    if "site" not in modules:  # a shell tool, started without it, needs packages now
-        __import__("site").main()
-    from .remote import connect as connect_remote
-
-    sock, clock, carrier = connect_remote(address, timeout_s)
-    return Channel(
-        sock, f"the gateway {address}", acknowledged=clock_acknowledged(clock), clock=clock,
-        carrier=carrier if waits else None,
-    )  # fmt: skip
-
-
-def _is_socket(path: str) -> bool:
-    try:
-        return S_ISSOCK(os.stat(path).st_mode)
-    except OSError:
-        return True  # it has just gone
 
 
 def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:

@@ -8,7 +8,8 @@ import sys
 from sioms.protocol.socketpath import cell_address
 
 from .cell_verbs import NodeEntry, WorkcellVerbs, is_part
-from .channel import CONNECT_S, ENOUGH_LOOK_S, Channel, connect_channel
+from .channel import ENOUGH_LOOK_S, Channel
+from .connecting import CONNECT_S, connect_channel
 from .faces import Blocking, BlockingWaiter, run
 from .node import NODE, Node
 from .session import MarkerVerbs

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from mmap import PROT_READ, mmap
 from typing import TYPE_CHECKING, Protocol
 
-from sioms.client.channel import connect
+from sioms.client.connecting import connect
 from sioms.protocol.journal import Event, JournalReader
 from sioms.protocol.link import PageShape
 from sioms.protocol.messages import MAX_PACKET, MAX_WRITE, MalformedMessage

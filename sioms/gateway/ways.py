@@ -10,7 +10,8 @@ import time
 from contextlib import suppress
 
 from sioms.client.cell_verbs import request_stop
-from sioms.client.channel import Call, Channel, connect
+from sioms.client.channel import Call, Channel
+from sioms.client.connecting import connect
 from sioms.protocol import link, verbs
 from sioms.protocol.flags import PROTOCOL_VERSION
 from sioms.protocol.link import Down, Up

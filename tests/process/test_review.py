@@ -19,7 +19,8 @@ from daemon_rig import Daemon, Waiting, raises, wait_for
 from wire_rig import SLIDE, Wire
 
 import sioms
-from sioms.client.channel import Call, Channel, connect
+from sioms.client.channel import Call, Channel
+from sioms.client.connecting import connect
 from sioms.protocol.flags import PROTOCOL_VERSION
 from sioms.protocol.records import BINARY_WRITE
 from sioms.protocol.verbs import Hello, Write

@@ -15,7 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from sioms.client.channel import KEEPALIVE, Call, Channel, connect
+from sioms.client.channel import KEEPALIVE, Call, Channel
+from sioms.client.connecting import connect
 from sioms.client.overdue import GRACE_S
 from sioms.protocol.messages import ClientVerb, decode, encode, refusal, reply
 from sioms.protocol.verbs import Ioctl, Subscribe, Write

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from sioms.client.channel import connect
+from sioms.client.connecting import connect
 from sioms.daemon.listening import Listening
 from sioms.protocol.socketpath import own_path
 from sioms.protocol.stopfile import open_stop_request
