@@ -183,10 +183,10 @@ class Stops:
 
     def _wake_drivers(self, but: DriverProcess | None = None) -> None:
         """Have processes look at the latch before their next tick, which looks anyway; of several devices in one, one
-        looks for all.
+        looks for all: one that ticks, where there is one, as others may not have begun to listen.
         """
         told = set() if but is None else {but.lives_in}
-        for device in self._cell.devices.values():
+        for device in sorted(self._cell.devices.values(), key=lambda device: device.contact is None):
             if device.is_there and device.lives_in not in told:
                 told.add(device.lives_in)
                 device.tell(driver_verbs.StopChanged())

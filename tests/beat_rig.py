@@ -166,6 +166,7 @@ class Device:
         self.driver: Ticker = self.runtime.driver  # type: ignore[assignment]
         self.member = Member(self.runtime, [], 0, "")
         group._members[self.runtime.poll_fd] = self.member
+        group._epoll.register(self.runtime.poll_fd)
         self.runtime.start()
         self.grid_ns = self.runtime._scheduled_ns % self.runtime.period_ns
         group._go_on(self.runtime.poll_fd, self.member)
@@ -246,11 +247,10 @@ def _drain(sock: socket.socket) -> None:
         return
 
 
-def _wait_for(polls: dict[int, Any]) -> Callable[[int, Any, int], int]:
+def _wait_for(groups: list[Group]) -> Callable[[int, Any, int], int]:
     def wait_for(poll: int, ready: Any, timeout_ms: int) -> int:
         assert timeout_ms == 0, "who waits for its turn does not sleep"
-        events = [fd for member in polls.values() if member.runtime.poll_fd == poll
-                  for fd, _ in member.runtime._epoll.poll(0)]  # fmt: skip
+        events = [fd for fd, _ in groups[-1]._members[poll].runtime._epoll.poll(0)]
         ready[: len(events)] = events
         return len(events)
 
@@ -264,14 +264,14 @@ def processes() -> Iterator[Callable[..., Process]]:
     with _in_python("sioms.sdk.quiet_step") as steps:
         pass  # the records of all other steps are what they are
     with pytest.MonkeyPatch.context() as patch:
-        members: dict[int, Any] = {}
+        groups: list[Group] = []
 
         def set_timer(fd: int, when_ns: int) -> int:
             next(timer for timer in CLOCK.timers if timer.fd == fd).set(when_ns)
             return 0
 
         patch.setattr(steps, "clock_ns", CLOCK)
-        patch.setattr(steps, "wait_for", _wait_for(members))
+        patch.setattr(steps, "wait_for", _wait_for(groups))
         patch.setattr(steps, "expirations", lambda fd: next(t for t in CLOCK.timers if t.fd == fd).expirations())
         patch.setattr(steps, "set_timer", set_timer)
         patch.setattr(steps.Quiet, "__init__", lambda self, **fields: self.__dict__.update(fields))
@@ -286,8 +286,7 @@ def processes() -> Iterator[Callable[..., Process]]:
 
         def make(hz: Sequence[float], phases: Sequence[float]) -> Process:
             made.append(Process(hz, phases, steps))
-            members.clear()
-            members.update(made[-1].group._members)
+            groups[:] = [made[-1].group]
             return made[-1]
 
         yield make

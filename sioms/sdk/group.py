@@ -6,6 +6,7 @@ without end, SIGKILL) it does to all in it; so devices share a process only wher
 
 from __future__ import annotations
 
+import gc
 import math
 import os
 import select
@@ -96,7 +97,7 @@ class Group:
         self._is_braking = False
         """Whether devices have just begun a stop, which has yet to show in a tick."""
         self._requests: ChangeWatch | None = None
-        self._is_settled = False
+        self._is_settled = self._has_litter = False
         self._of = np.zeros(MOST_FILES, dtype=np.int64)
         self._ready = np.zeros(MOST_EVENTS, dtype=np.int64)
         self._many = Many(
@@ -208,12 +209,22 @@ class Group:
     def _start(self, member: Member) -> None:
         runtime = member.runtime
         self._settle(member)
+        self._clear_away()
         runtime.sees_requests = self._requests is not None
         self._members[runtime.poll_fd] = member
         self._epoll.register(runtime.poll_fd, select.EPOLLIN)
         self._guarded(member, runtime.start)
         self._go_on(runtime.poll_fd, member)
         time.sleep(PAUSE_S)
+
+    def _clear_away(self) -> None:
+        """Free what is left of devices that have ended: their parts know each other, and the collector is off.
+
+        That takes some ms, as the construction of the device does that comes now; nothing else has to wait for it.
+        """
+        if self._has_litter:
+            self._has_litter = False
+            gc.collect()
 
     def _settle(self, member: Member) -> None:
         """Become who the process shall be, with the first of its devices."""
@@ -263,6 +274,7 @@ class Group:
             self._epoll.unregister(fd)
             member.runtime.release()
             _close(member.fds)
+            self._has_litter = True
 
     def _lend(self, fd: int, member: Member) -> None:
         self._pauses.pop(fd, None)

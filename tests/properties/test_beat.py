@@ -6,18 +6,21 @@ of its period, for an instant that has come, and never sooner than a quarter of 
 
 from __future__ import annotations
 
+import gc
 import os
 import random
+import weakref
 from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 from beat_rig import CLOCK, Device, Process, processes
+from own_writes_rig import SEED
 
 from sioms.protocol.driver_verbs import DriverVerb
 
 TRIALS = int(os.environ.get("SIOMS_BEATS", "6"))
-"""Of each set of devices; 180 have passed with any."""
+"""With each set of devices."""
 
 
 def _pass(process: Process, chance: random.Random) -> None:
@@ -101,7 +104,7 @@ def _see_it_tick(process: Process) -> None:
 @pytest.mark.parametrize("hz", [(100.0, 100.0, 100.0), (100.0, 20.0, 250.0), (1000.0, 100.0)])
 def test_every_device_ticks_as_its_beat_says(hz: tuple[float, ...]) -> None:
     for trial in range(TRIALS):
-        chance = random.Random(trial)
+        chance = random.Random(trial + 100_000 * SEED)
         with processes() as make:
             process = make(hz, [chance.random() for _ in hz])
             for _ in range(3):
@@ -113,3 +116,24 @@ def test_every_device_ticks_as_its_beat_says(hz: tuple[float, ...]) -> None:
                         _check_ticks(device)
                 except AssertionError as error:
                     raise AssertionError(f"{error}; trial {trial}") from error
+
+
+def test_nothing_is_left_of_a_device_that_has_ended() -> None:
+    """A device that is restarted or changed comes back to the process that is there."""
+    with processes() as make:
+        process = make((100.0, 100.0), (0.0, 0.5))
+        group, device = process.group, process.devices.pop()
+        ended, fd = weakref.ref(device.runtime), device.runtime.poll_fd
+        device.runtime.running = False
+        group._go_on(fd, group._members[fd])
+        device.control.close()
+        for kept in device._kept:
+            os.close(kept)
+        del device
+        was = len(os.listdir("/proc/self/fd"))
+        gc.disable()
+        try:
+            group._clear_away()
+            assert ended() is None and len(os.listdir("/proc/self/fd")) < was, "memory and what it maps"
+        finally:
+            gc.enable()

@@ -30,7 +30,7 @@ class Rig:
         record = SimpleNamespace(look=lambda: None, state=state, note=self._note, path="stops")
         shared: Any = SimpleNamespace(latch=self.latch, request=self.request, record=record)
         cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
-        self.stops, self._state = Stops(cell), state
+        self.cell, self.stops, self._state = cell, Stops(cell), state
 
     def _note(self, entry: dict[str, Any]) -> None:
         self.noted.append(entry["by"])
@@ -67,3 +67,28 @@ def test_a_session_without_a_request_stops_and_a_later_request_is_heard(rig: Rig
     assert rig.noted == ["eva: enough"]
     rig.request.request(2000, PID, "again")
     assert f"pid {PID}: again" in rig.stops.hear_request()
+
+
+class Device:
+    """A device as far as stops know it: the process that it is in, and what it is told."""
+
+    def __init__(self, process: str, name: str, *, ticks: bool = True, is_there: bool = True) -> None:
+        self.name, self.lives_in = name, (process, "" if process else name)
+        self.contact, self.is_there, self.told = (object() if ticks else None), is_there, 0
+
+    def tell(self, message: Any) -> None:
+        self.told += 1
+
+
+def test_one_device_of_each_process_is_told_of_a_stop_and_one_that_listens(rig: Rig) -> None:
+    devices = [
+        Device("many", "starts", ticks=False), Device("many", "ticks"), Device("many", "too"),
+        Device("", "alone"), Device("", "many"), Device("few", "begins", ticks=False),
+        Device("", "off", is_there=False),
+    ]  # fmt: skip
+    rig.cell.devices.update({device.name: device for device in devices})  # type: ignore[misc]
+    rig.stops.stop_workcell("eva")
+    assert [device.name for device in devices if device.told] == ["ticks", "alone", "many", "begins"]
+    assert max(device.told for device in devices) == 1
+    rig.stops.stopped(devices[2], "an input")  # type: ignore[arg-type]
+    assert [device.told for device in devices] == [0, 1, 0, 2, 2, 2, 0], "its own process has seen it"

@@ -108,6 +108,17 @@ def test_one_that_has_ended_is_waited_for_no_more(group):
     assert not group._members and not is_readable(group._epoll.fileno())
 
 
+def test_what_is_left_of_one_that_has_ended_is_cleared_away_when_another_comes(group, monkeypatch):
+    cleared = []
+    monkeypatch.setattr("sioms.sdk.group.gc.collect", lambda: cleared.append(1))
+    (member,) = start(group, "")
+    member.runtime.running = False
+    group._serve(member.runtime.poll_fd, member)
+    assert not cleared, "others tick on first"
+    start(group, "", "")
+    assert len(cleared) == 1
+
+
 def test_what_has_more_to_do_is_served_without_an_event(group):
     (member,) = start(group, "")
     os.eventfd_read(member.runtime.poll_fd)
