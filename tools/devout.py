@@ -232,5 +232,5 @@ class Writer:
                 "of an iteration"
             )
         if not self.iterations:
-            raise BadInput(f"the input is empty; want {self._width} numbers for an iteration")
+            raise BadInput(f"the input is empty; want {self._width} number{'s' * (self._width > 1)} for an iteration")
         return False

@@ -95,7 +95,8 @@ class Setter:
         nodes = [self._open(target) for target in targets if target.flags]
         plan = [(node, key, self._take(node, key)) for node, target in nodes for key in target.flags]
         if self._given and self._numbers.numbers:
-            raise UsageError(f"{len(self._numbers.numbers)} numbers too many; -c takes one per axis, -g n*n")
+            left = len(self._numbers.numbers)
+            raise UsageError(f"{left} number{'s' * (left > 1)} too many; -c takes one per axis, -g n*n")
         synched = [node for node, key, _ in plan if key == "s"]
         for node, key, numbers in plan:
             if key != "s":

@@ -162,7 +162,7 @@ def test_a_held_node_names_its_holder_and_can_be_read(
         ("devout -rvw mod0.xaxis 1", "add -t"),
         ("sdev mod0", "nothing to do"),
         ("sdev -z", "no device given"),
-        ("sdev -c 1 2 3 4 5 mod0", "1 numbers too many"),
+        ("sdev -c 1 2 3 4 5 mod0", "1 number too many"),
         ("sdev -g mod0", "class analog"),
         ("smarkers 5", "want -r alone"),
         ("smarkers -w foo", "want a marker"),
@@ -178,6 +178,8 @@ def test_values_that_a_device_cannot_take(shell: Shell) -> None:
     refused(shell("devout gripper0 256"), "data 256; want 0 to 255")
     refused(shell("devout gripper0 1.5"), "integer")
     refused(shell("devout -t mod0.xaxis 0 0"), "time 0 s")
+    refused(shell("devout -t mod0.xaxis", ""), "want 2 numbers for an iteration")
+    refused(shell("devout mod0.xaxis", ""), "want 1 number for an iteration")
     refused(shell("sdev -c mod0", "1 2"), "want 4 numbers: there are 2")
     refused(shell("devout lord1 1"), "read-only node")
 
