@@ -250,12 +250,15 @@ class World:
         ):
             patch.setattr(sioms.motion.bank, "plain_of", plain.plain_of)
             patch.setattr(sioms.sdk.desk, "Desk", serving.Desk)
+            patch.setattr(sioms.sdk.desk, "StopFile", serving.StopFile)
             serving.clock_ns, serving.admits = CLOCK, plain.admits
             module.serve_packet = serving.serve_packet
             self._writer_of, self._serve_writer = serving.writer_of, module.serve_writer
             module.clock_ns, module.wait_for = CLOCK, self._wait_for
             module.expirations = lambda fd: runtime._timer.expirations() if fd == 1 else 1
             module.set_timer = lambda fd, when_ns: 0
+            module.is_requested = serving.is_requested
+            module.wait_for_one = lambda fd, until_ns: 0
             self.run_quietly = module.run
             return QuietRun(
                 steps, 0, 1, 2, CONTROL, runtime._latch_words, runtime.period_ns, runtime._lead_ns,

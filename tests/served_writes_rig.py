@@ -23,7 +23,7 @@ from sioms.native.system import changed_ns
 from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.messages import encode
 from sioms.protocol.records import AXIS_WRITE, WRITE
-from sioms.sdk.serve_step import MOST_KEPT, MOST_WRITERS, REPLY, ROOM, Desk, serve_packet
+from sioms.sdk.serve_step import MOST_KEPT, MOST_WRITERS, REPLY, ROOM, Desk, StopFile, serve_packet
 
 AXES = [2, 0, 3]
 """Bank axes of the node; axis 1 is another client's."""
@@ -133,7 +133,8 @@ class Served:
         self.desk = Desk(
             plain=plain_of(queue), count=1, fds=row(self.theirs.fileno(), count=MOST_WRITERS),
             first=row(1, count=MOST_WRITERS), known=row(len(AXES), count=MOST_WRITERS), axes=row(1, *AXES, count=4),
-            heard=row(count=MOST_WRITERS), request=request, word=0, changed=changed_ns(request), gives_way=0,
+            heard=row(count=MOST_WRITERS),
+            request=StopFile(there=1, file=request, word=0, changed=changed_ns(request)), gives_way=0,
             packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, size=row(), writer=row(), came=row(),
             effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0, grace_ns=0,
             reply=np.zeros(REPLY, dtype=np.uint8),

@@ -169,11 +169,16 @@ def look_at_axes(s: SimulatedAxes, now_ns: int) -> int:
 
 
 @step
-def brake_axes(s: SimulatedAxes, now_ns: int, latches: int, unused: int) -> int:
-    """Begin to stop all axes, not later than a tick after the last. Returns 1 where that is for the driver."""
+def brake_axes(s: SimulatedAxes, now_ns: int, latches: int, since_ns: int) -> int:
+    """Begin to stop all axes as from an instant, but neither before the last tick nor later than a tick after it.
+    Returns 1 where that is for the driver.
+    """
     if s.found or now_ns - s.last_ns > s.late_ns:
         return 1
-    return stop_axes(s.stopping, now_ns if s.still else min(now_ns, s.loop.last_ns + s.period_ns), latches)
+    if s.still:
+        return stop_axes(s.stopping, now_ns, latches)
+    latest_ns = min(now_ns, s.loop.last_ns + s.period_ns)
+    return stop_axes(s.stopping, min(max(since_ns, s.loop.last_ns), latest_ns), latches)
 
 
 @step

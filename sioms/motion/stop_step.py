@@ -69,8 +69,13 @@ def is_behind(a: Loop, i: int) -> int:
 
 @step
 def stop_axes(s: Stopping, now_ns: int, latches: int) -> int:
-    """Begin to stop all axes at now, latched or not. Returns 1, and nothing is done, where that is for the bank."""
+    """Begin to stop all axes at now, or where the present segment of one has begun since; latched or not. Returns 1,
+    and nothing is done, where that is for the bank.
+    """
     a = s.loop
+    for i in range(a.n):
+        if a.kind[i] != HOLD and a.kind[i] != STOP:
+            now_ns = max(now_ns, a.segment_ns[i])
     if now_ns >= a.next_ns:
         return 1
     for i in range(a.n):

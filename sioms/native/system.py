@@ -30,6 +30,16 @@ static inline int64_t sioms_wait_for(int64_t poll, int64_t *ready, int64_t timeo
     return count < 0 ? 0 : count;
 }
 
+static inline int64_t sioms_wait_for_one(int64_t fd, int64_t until_ns)
+{
+    struct pollfd one = {.fd = (int)fd, .events = POLLIN};
+    int64_t left = until_ns - sioms_clock_ns();
+    if (left < 0)
+        left = 0;
+    struct timespec most = {left / 1000000000, left % 1000000000};
+    return ppoll(&one, 1, &most, NULL) > 0;
+}
+
 static inline void *sioms_record_at(int64_t address) { return (void *)address; }
 
 static inline int64_t sioms_expirations(int64_t timer)
@@ -104,6 +114,15 @@ def wait_for(poll: int, ready: Integers, timeout_ms: int) -> int:
     for i, (fd, _) in enumerate(events):
         ready[i] = fd
     return len(events)
+
+
+def wait_for_one(fd: int, until_ns: int) -> int:
+    """Wait until a descriptor is readable, at most until a time [ns, CLOCK_MONOTONIC]; return whether it is. A signal
+    ends the wait, too.
+    """
+    one = select.poll()
+    one.register(fd, select.POLLIN)
+    return int(bool(one.poll(max(until_ns - time.monotonic_ns(), 0) * 1e-6)))
 
 
 def record_at(address: int) -> Context:

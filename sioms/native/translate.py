@@ -17,7 +17,9 @@ from . import numbers, system
 from .language import ARRAYS, PREFIX, Bytes, Call, Context, Flags, Floats, Integers, Record, checksum
 
 HEAD = """/* Made by sioms.native.translate; do not edit. */
+#define _GNU_SOURCE
 #include <math.h>
+#include <poll.h>
 #include <sched.h>
 #include <stdint.h>
 #include <stdlib.h>

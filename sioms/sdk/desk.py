@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .blocks import AnyBlock, AxisBlock
-from .serve_step import MOST_KEPT, MOST_WRITERS, REPLY, ROOM, Desk
+from .serve_step import MOST_KEPT, MOST_WRITERS, REPLY, ROOM, Desk, StopFile
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -34,7 +34,7 @@ class WriteDesk:
         blocks: of the device.
         clients: its handles.
         stops, pages: of the process.
-        request: descriptor of the stop-request file; below 0: no writes are served by steps.
+        request: descriptor of the stop-request file; below 0: others look at it, and no writes are served by steps.
         gives_way: whether processes of the same priority may run after every packet.
         period_ns: of its ticks [ns].
     """
@@ -49,6 +49,8 @@ class WriteDesk:
         axes = [block for block in blocks if isinstance(block, AxisBlock)] if request >= 0 else []
         plain = axes[0].bank.plain if axes else None
         self._block = axes[0] if plain is not None else None
+        self.request = StopFile(there=int(request >= 0), file=request, word=0, changed=0)
+        """What is seen of the file."""
         if plain is None:
             self.record = Desk.empty()
             return
@@ -58,7 +60,7 @@ class WriteDesk:
 
         self.record = Desk(
             plain=plain, count=0, fds=row(MOST_WRITERS), first=row(MOST_WRITERS), known=row(MOST_WRITERS),
-            axes=row(axes[0].n), heard=row(MOST_WRITERS), request=request, word=0, changed=0, gives_way=int(gives_way),
+            axes=row(axes[0].n), heard=row(MOST_WRITERS), request=self.request, gives_way=int(gives_way),
             grace_ns=GRACE_NS if period_ns <= SOON_NS else 0,
             packets=self._packets, kept=0, size=row(MOST_KEPT), writer=row(MOST_KEPT),
             came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
@@ -68,6 +70,8 @@ class WriteDesk:
     def lend(self) -> None:
         """Let steps serve the writers whose next packet has nothing to wait for."""
         block, record = self._block, self.record
+        word, self.request.changed = self._stops.seen_request
+        self.request.word = word - (word >> 63 << 64)
         if block is None:
             return
         record.count = record.kept = record.waiting = 0
@@ -80,8 +84,6 @@ class WriteDesk:
         ][:MOST_WRITERS]
         if writers != self._writers:
             self._list(writers)
-        word, record.changed = self._stops.seen_request
-        record.word = word - (word >> 63 << 64)
         record.count = len(writers)
 
     def _list(self, writers: list[Handle]) -> None:

@@ -176,9 +176,10 @@ class QuietSteps(Protocol):
 
     @property
     def stop(self) -> Callable[[Any, int, int, int], int]:
-        """Step of a stop: takes the record, now [ns], whether it is latched, and 0; all axes begin to stop, as
-        ``Bank.emergency_stop`` would have them, or ``Bank.stop``, which is called later for what else there is to be
-        done. Returns 0, or 1 when nothing has been done because it takes more than that.
+        """Step of a stop: takes the record, now [ns], whether it is latched, and when it was asked for [ns]; all axes
+        begin to stop, as from then if that is behind the last tick, as ``Bank.emergency_stop`` would have them, or
+        ``Bank.stop``, which is called later for what else there is to be done. Returns 0, or 1 when nothing has been
+        done because it takes more than that.
         """
 
     def is_ready(self, watched: bool) -> bool:

@@ -12,13 +12,27 @@ from __future__ import annotations
 from typing import Final
 
 from sioms.native.language import Call, Context, Integers, Record, step
-from sioms.native.system import MOST_EVENTS, clock_ns, expirations, fence, record_at, set_timer, wait_for, wake
+from sioms.native.system import (
+    MOST_EVENTS,
+    changed_ns,
+    clock_ns,
+    expirations,
+    fence,
+    first_word_of,
+    record_at,
+    set_timer,
+    wait_for,
+    wait_for_one,
+    wake,
+)
 
-from .serve_step import Desk, serve_packet, writer_of
+from .serve_step import Desk, StopFile, is_requested, serve_packet, writer_of
 
 STOPPED: Final = 0
 RESETS: Final = 1
 DAEMON_ALIVE: Final = 2
+ANSWERED: Final = 3
+ANSWERED_AT: Final = 4
 ORDERS: Final = 5
 """Words of the latch page."""
 HEAD: Final = 9
@@ -40,6 +54,11 @@ LEFT: Final = 1
 HEARD: Final = 2
 """What has become of a descriptor that was ready: all is done; it is the loop's; all is done, and the loop has to hear
 of it."""
+HALTS: Final = 1
+STOPS: Final = 2
+"""How axes brake: as those whose owner has gone, or latched."""
+MOMENT_NS: Final = 1_000_000
+"""How long the loop leaves the processor to devices that have yet to show that they brake."""
 RESTED: Final = 1
 STIRS: Final = 2
 """What the loop has to hear: the device has been at rest for long; it has been idle and is at rest no more."""
@@ -73,12 +92,12 @@ class Quiet(Record):
     its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
     else it is idle when it has been at rest for ``rest_ns`` since ``restless_ns``, and ``told`` is RESTED or STIRS.
 
-    ``desk`` serves writes.
+    ``desk`` serves writes. By the file ``request`` clients ask for a stop.
 
     ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: the loop has yet to
     see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: steps have
-    begun a stop, or a halt; ``braked_ns``: when something was stopped last. ``patient``: the device waits for its turn
-    in a process of several, and ticks on meanwhile.
+    begun a stop, STOPS, or a halt, HALTS; ``braked_ns``: when something was stopped last. ``patient``: the device waits
+    for its turn in a process of several, and ticks on meanwhile.
 
     ``control``: descriptor of the daemon's socket. ``called``: it is among those that are ready. ``spare``: as many
     numbers as ``ready``.
@@ -114,6 +133,7 @@ class Quiet(Record):
     rest: Call
     stop: Call
     desk: Desk
+    request: StopFile
     early_ns: int
     heeded_ns: int
     brakes: int
@@ -196,13 +216,31 @@ def owe(q: Quiet) -> int:
 
 @step
 def begin_stop(q: Quiet, now_ns: int) -> int:
-    """Begin to stop as the latch wants it, with a tick soon. Returns 1, and nothing is done, where the loop has to."""
+    """Begin to stop as the latch wants it, as from when it was latched, with a tick soon. Returns 1, and nothing is
+    done, where the loop has to.
+    """
     if not q.latch[STOPPED] or q.latch[STOPPED] == q.stopped or q.latch[RESETS] != q.resets:
         return 1
-    if begin_to_brake(q, now_ns, 1):
+    if q.brakes != STOPS and begin_to_brake(q, now_ns, 1, q.latch[STOPPED]):
         return 1
     q.stopped = q.latch[STOPPED]
     return 0
+
+
+@step
+def begin_asked_stop(q: Quiet, now_ns: int) -> int:
+    """Begin to stop where somebody asks for it, who may not have come to the latch yet; return whether all axes brake
+    for a stop. What a reset has answered is no stop any more.
+    """
+    f = q.request
+    if q.latch[STOPPED]:
+        begin_stop(q, now_ns)
+    elif not (q.brakes == STOPS or q.stopped or q.latch[RESETS] != q.resets) and is_requested(f):
+        word = first_word_of(f.file)
+        answered = word == q.latch[ANSWERED] and changed_ns(f.file) == q.latch[ANSWERED_AT]
+        if word >= 0 and not answered:
+            begin_to_brake(q, now_ns, 1, now_ns)
+    return q.brakes == STOPS
 
 
 @step
@@ -210,15 +248,17 @@ def begin_halt(q: Quiet, now_ns: int) -> int:
     """Begin to halt all axes, whose owner has gone, with a tick soon. Returns 1, and nothing is done, where the loop
     has to.
     """
-    return 0 if q.brakes else begin_to_brake(q, now_ns, 0)
+    return 0 if q.brakes else begin_to_brake(q, now_ns, 0, now_ns)
 
 
 @step
-def begin_to_brake(q: Quiet, now_ns: int, latches: int) -> int:
-    """Have the device begin to stop, with a tick soon; return whether it has refused."""
-    if q.stop(q.device, now_ns, latches, 0):
+def begin_to_brake(q: Quiet, now_ns: int, latches: int, since_ns: int) -> int:
+    """Have the device begin to stop, as from an instant since its last tick, with a tick soon; return whether it has
+    refused.
+    """
+    if q.stop(q.device, now_ns, latches, since_ns):
         return 1
-    q.brakes = 1
+    q.brakes = STOPS if latches else HALTS
     q.braked_ns = now_ns
     owe(q)
     if not q.announced:
@@ -451,11 +491,32 @@ def heed(q: Quiet, count: int) -> int:
 
 
 @step
+def stop_first(q: Quiet) -> int:
+    """Where a stop is what the loop is to hear of, begin it, and tick on for a moment: the loop takes longer than a
+    period for what else there is to be done, and all devices shall brake before that of any has the processor.
+    """
+    if q.waiting == MOST_EVENTS or q.left or q.slackens or q.told or q.desk.kept or q.lead_ns or q.periods > 1:
+        return 0
+    until_ns = clock_ns() + MOMENT_NS
+    if not begin_asked_stop(q, until_ns - MOMENT_NS):
+        return 0
+    while clock_ns() < until_ns and wait_for_one(q.timer, until_ns):
+        q.expired = expirations(q.timer)
+        if q.expired and one_tick(q) == LEFT:
+            q.ready[q.waiting] = q.timer
+            q.waiting += 1
+            q.left = 1
+            return 0
+    return 0
+
+
+@step
 def run(q: Quiet) -> int:
     """Wait and tick until the loop has to go on."""
     while True:
         count = wait_for(q.poll, q.ready, -1)
         if not count or heed(q, count):  # none are after a signal
+            stop_first(q)
             return q.waiting
 
 

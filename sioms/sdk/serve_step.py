@@ -50,11 +50,20 @@ INFINITE: Final = 0x7FF
 MOST_NUMBER: Final = 1 << 53
 
 
+class StopFile(Record):
+    """The stop-request ``file``, if it is ``there``, of which ``word`` and ``changed`` have been seen."""
+
+    there: int
+    file: int
+    word: int
+    changed: int
+
+
 class Desk(Record):
     """Where the writes of clients come in.
 
     ``count`` writers may be served by steps, with their sockets ``fds``, and the bank axes of each, ``known`` of
-    ``axes`` from ``first`` on. ``request`` is the stop-request file, of which ``word`` and ``changed`` have been seen.
+    ``axes`` from ``first`` on. A write comes behind a ``request`` to stop.
 
     ``heard``: the instant that the newest Heard of each writer tells, never one that has yet to come; 0: none came.
 
@@ -72,9 +81,7 @@ class Desk(Record):
     known: Integers
     axes: Integers
     heard: Integers
-    request: int
-    word: int
-    changed: int
+    request: StopFile
     gives_way: int
     grace_ns: int
     packets: Bytes
@@ -91,6 +98,12 @@ class Desk(Record):
     at: int
     records: int
     reply: Bytes
+
+
+@step
+def is_requested(f: StopFile) -> int:
+    """Return whether somebody has asked for a stop by the file."""
+    return f.there and (first_word_of(f.file) != f.word or changed_ns(f.file) != f.changed)
 
 
 @step
@@ -228,7 +241,7 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     if d.kept >= MOST_KEPT:
         return 1
     came_ns = clock_ns()
-    if first_word_of(d.request) != d.word or changed_ns(d.request) != d.changed:
+    if is_requested(d.request):
         return 1
     begin = d.kept * ROOM
     size = look_at_packet(d.fds[who], d.packets, begin, ROOM)

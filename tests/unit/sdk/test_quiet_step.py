@@ -23,6 +23,7 @@ from sioms.sdk.quiet_step import (
     DAEMON_ALIVE,
     DONE,
     FIRST,
+    HALTS,
     HEARD,
     LEFT,
     ORDERS,
@@ -32,6 +33,7 @@ from sioms.sdk.quiet_step import (
     SLOT,
     STIRS,
     STOPPED,
+    STOPS,
     Many,
     Page,
     Quiet,
@@ -46,7 +48,7 @@ from sioms.sdk.quiet_step import (
     wait_turn,
 )
 from sioms.sdk.rt import TimerFd
-from sioms.sdk.serve_step import Desk
+from sioms.sdk.serve_step import Desk, StopFile
 
 PERIOD_NS, LEASE_NS = 1_000_000, 60_000_000_000
 STEP = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
@@ -64,7 +66,7 @@ class Device:
 
     def __init__(self, lead_ns=0, **fields):
         self.ticks, self.slacks, self.answer, self.slackens, self.rests, self.stops = [], 0, 0, 0, 0, 1
-        self.latched = []
+        self.latched, self.ticks_next = [], False
         self.timer, self.other, self.control = (os.eventfd(0, os.EFD_NONBLOCK) for _ in range(3))
         self.line = TimerFd()
         self.poll = select.epoll()
@@ -80,8 +82,9 @@ class Device:
             "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
             "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
             "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0, "braked_ns": 0, "patient": 0,
-            "called": 0, "control": self.control, "desk": Desk.empty(), "spare": np.zeros(64, dtype=np.int64),
-            "done": 0, "expired": 1, "slackens": 0, "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
+            "called": 0, "control": self.control, "desk": Desk.empty(), "request": StopFile.empty(),
+            "spare": np.zeros(64, dtype=np.int64), "done": 0, "expired": 1, "slackens": 0,
+            "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
         }  # fmt: skip
         for name, function in (
             ("tick", self._tick),
@@ -104,8 +107,11 @@ class Device:
     def _rest(self, *_):
         return self.rests
 
-    def _stop(self, _device, _now_ns, latches, _):
+    def _stop(self, _device, _now_ns, latches, since_ns):
         self.latched.append(latches)
+        self.since_ns = since_ns
+        if self.ticks_next:
+            os.eventfd_write(self.timer, 1)
         return self.stops
 
     def close(self):
@@ -235,10 +241,72 @@ def test_a_halt_is_begun_by_steps_and_latches_nothing(make):
     assert not device.quiet.heeded_ns and not device.quiet.brakes
     device.stops = 0
     assert begin_halt(device.quiet, time.monotonic_ns()) == 0
-    assert (device.quiet.heeded_ns, device.quiet.brakes, device.quiet.stopped) == (77, 1, 0)
+    assert (device.quiet.heeded_ns, device.quiet.brakes, device.quiet.stopped) == (77, HALTS, 0)
     assert begin_halt(device.quiet, time.monotonic_ns()) == 0 and device.latched == [0, 0], "once"
     device.latch[STOPPED] = 5
     assert one_tick(device.quiet) == HEARD and device.latched == [0, 0, 1], "a stop is one that is latched"
+
+
+def test_a_stop_begins_when_it_was_latched(make):
+    device = make(began_ns=77)
+    device.stops, device.latch[STOPPED] = 0, 5
+    assert one_tick(device.quiet) == HEARD and device.since_ns == 5
+
+
+class Requests:
+    """A stop-request file, and what a device that is asked by it has seen."""
+
+    def __init__(self, device):
+        self.fd, seen = os.memfd_create("request"), device.quiet.request
+        seen.there, seen.file, seen.word, seen.changed = 1, self.fd, 0, os.fstat(self.fd).st_mtime_ns
+
+    def ask(self):
+        """Ask for a stop; return what a reset answers by."""
+        os.pwrite(self.fd, (7).to_bytes(8, "little"), 0)
+        return 7, os.fstat(self.fd).st_mtime_ns
+
+
+@pytest.mark.parametrize("by", ["latch", "file"])
+def test_who_is_told_of_a_stop_brakes_and_ticks_before_the_loop_hears_of_it(make, by):
+    device = make(began_ns=77, expired=0)
+    device.stops, device.ticks_next = 0, True
+    if by == "latch":
+        device.latch[STOPPED] = 5
+    else:
+        Requests(device).ask()
+    os.eventfd_write(device.other, 1)
+    assert run(device.quiet) == 1 and device.ready[0] == device.other, "the loop has yet to do the rest"
+    assert device.latched == [1] and device.quiet.brakes == STOPS
+    assert len(device.ticks) == 1 and device.shown_ns == 77, "it shows what was asked for before the stop"
+    device.latch[STOPPED] = 5
+    begin_stop(device.quiet, time.monotonic_ns())
+    assert device.quiet.stopped == 5 and device.latched == [1], "it is the same stop"
+
+
+@pytest.mark.parametrize("why", ["answered", "seen", "stopped already", "reset", "refused", "kept", "left", "seldom"])
+def test_what_is_no_stop_for_steps_is_left_to_the_loop_at_once(make, why):
+    device = make(expired=0, lead_ns=100 * (why == "seldom"), stopped=5 * (why == "stopped already"))
+    device.stops, device.ticks_next = why == "refused", True
+    requests = Requests(device)
+    mark = requests.ask() if why != "seen" else (0, 0)
+    if why == "answered":
+        device.latch[3], device.latch[4] = mark
+    device.latch[RESETS] = why == "reset"
+    device.quiet.desk.kept = why == "kept"
+    device.quiet.left = why == "left"
+    os.eventfd_write(device.other, 1)
+    assert run(device.quiet) == 1
+    assert not device.ticks and not device.quiet.brakes
+    assert device.latched == [1] * (why == "refused")
+
+
+def test_a_tick_behind_a_stop_that_is_the_loops_is_handed_over(make):
+    device = make(expired=0)
+    device.stops, device.answer, device.latch[STOPPED], device.ticks_next = 0, 1, 5, True
+    os.eventfd_write(device.other, 1)
+    assert run(device.quiet) == 2
+    assert set(device.ready[:2]) == {device.other, device.timer}
+    assert device.quiet.left and device.quiet.expired, "its timer has been read"
 
 
 def test_an_order_to_another_device_is_not_looked_at_by_the_loop(make):
@@ -526,7 +594,7 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
         SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
         SimpleNamespace(lend=lambda: lends), SimpleNamespace(seen=(3, 2, 1)),
         SimpleNamespace(until_ns=lambda: waits_ns), SimpleNamespace(until_ns=lambda: clients_ns), statistics,
-        SimpleNamespace(record=Desk.empty(), lend=lambda: None),
+        SimpleNamespace(record=Desk.empty(), request=StopFile.empty(), lend=lambda: None),
     )  # fmt: skip
     record.close()
     return quiet

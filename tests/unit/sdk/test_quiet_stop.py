@@ -38,12 +38,12 @@ def values(cell, but=frozenset()):
     return rows, cell.driver._world.plant.data.tolist()
 
 
-def stop_by_steps(cell, now_ns, latches=1):
-    """Begin a stop as the loop in compiled code does; tell whether the steps have taken it."""
+def stop_by_steps(cell, now_ns, latches=1, since_ns=0):
+    """Begin a stop as the loop in compiled code does, as from an instant; tell whether the steps have taken it."""
     steps = cell.steps
     if not steps.is_ready(True) or not cell.pages.lend():
         return False
-    taken = steps.stop(steps.record, now_ns, latches, 0) == 0
+    taken = steps.stop(steps.record, now_ns, latches, since_ns or now_ns) == 0
     if not taken:
         take_back(cell)
     return taken
@@ -96,7 +96,8 @@ def test_a_stop_by_steps_is_the_stop_of_the_bank(owed, latches):
                         cell.driver.bank.append(records, AXES, now_ns)
         assert told(plain) == told(quiet)
         stop_ns = now_ns + int(rng.integers(PERIOD_NS))
-        owes = stop_by_steps(quiet, stop_ns, latches)
+        seen_ns = stop_ns + int(rng.integers(now_ns + PERIOD_NS - stop_ns))  # it is the same whenever steps find it
+        owes = stop_by_steps(quiet, seen_ns, latches, stop_ns)
         taken += owes
         if not owes:
             stop(quiet, stop_ns, latches)
@@ -185,6 +186,26 @@ def test_stops_by_steps_of_stopped_axes_and_what_comes_after_the_reset():
         now_ns = go_on(cell, now_ns, 1)
         assert np.abs(cell.driver.bank.rows["commanded_position"] - before).max() <= 0.5 * PERIOD_NS * 1.01e-9
     assert np.abs(cell.driver.bank.rows["position"] - 0.02).max() < 2e-3
+
+
+def test_a_stop_by_steps_begins_neither_before_the_last_tick_nor_before_what_is_under_way():
+    cell = Cell(True)
+    bank, records = cell.driver.bank, np.zeros(3, numpy_dtype(NodeClass.AXIS))
+    records["axis"], records["control_mode"], records["velocity"] = AXES, int(ControlMode.VELOCITY), 0.1
+    now_ns = go_on(cell, 1_000_000_000, 20)
+    bank.append(records, AXES, now_ns - PERIOD_NS)
+    now_ns = go_on(cell, now_ns, 100)
+    assert stop_by_steps(cell, now_ns, since_ns=1)
+    assert bank.stopping.braked_ns == now_ns - PERIOD_NS, "the last tick has shown that they went on"
+    take_back(cell)
+    bank.emergency_stop(AXES, now_ns)
+    bank.reset(AXES)
+    now_ns = go_on(cell, now_ns, 300)
+    bank.append(records, AXES, now_ns - PERIOD_NS)
+    now_ns = go_on(cell, now_ns, 2)
+    begun_ns = now_ns - PERIOD_NS + 1000
+    bank._sequencer.store.segment_ns[1] = begun_ns
+    assert stop_by_steps(cell, now_ns, since_ns=1) and bank.stopping.braked_ns == begun_ns
 
 
 def test_who_is_behind_by_the_step_is_so_by_the_law():
