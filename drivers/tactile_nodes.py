@@ -236,6 +236,7 @@ class TactileNodes:
             return None
 
     def _make(self, finger: Finger) -> ShapeSensor:
+        from sioms.tactile.cylinder import forget_amplitudes
         from sioms.tactile.sensing import ShapeSensor
 
         settings = self._settings
@@ -247,6 +248,7 @@ class TactileNodes:
             settle_frames=settings.settle_frames,
         )
         sensor.warm()
+        forget_amplitudes()
         return sensor
 
 

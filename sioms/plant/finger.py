@@ -143,14 +143,14 @@ class TactileArray:
         n = len(shape.angles_rad)
         self.shape, self.truth = shape, scattered(shape)
         body = Layer(shape.core_m, shape.radius_m, shape.poisson_ratio, shape.shear_modulus_pa)
-        self._rubber = rubber(body, tuple(self.truth.radii_m.tolist()))
+        radii_m, self._rows = np.unique(self.truth.radii_m, return_inverse=True)  # equally deep ones share a pattern
+        self._rubber = rubber(body, tuple(radii_m.tolist()))
         self._factor, self.offset = (np.broadcast_to(np.asarray(v, dtype=np.float64), n).copy() for v in (gain, offset))
         self._noise, self._step = noise, resolution
         self._random = np.random.default_rng(seed)
         self._late = np.zeros(n)
         self._all = False
         self._time_s: float | None = None
-        self._rows = np.arange(n)
 
     def mount(self, indenter_radius_m: float) -> None:
         """Tabulate an indenter, so that the first touch with it need not; takes a few tenths of a second.

@@ -132,6 +132,8 @@ def become_realtime(priority: int, log: Callable[[str, str], None]) -> list[str]
     """
     refused = []
     gc.collect()  # first: it may take longer than a real-time process may work without a pause
+    with suppress(AttributeError):  # another libc
+        _libc.malloc_trim(0)  # what only the start needed; memory that is locked cannot be given back
     gc.freeze()
     gc.disable()
     _libc.prctl(_PR_SET_TIMERSLACK, 1, 0, 0, 0)

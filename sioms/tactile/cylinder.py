@@ -227,6 +227,11 @@ def _amplitudes(cylinder: Cylinder, wave: tuple[float, ...], basis: Basis) -> Ex
     return _solve(np.moveaxis(conditions, 2, 0), loads)
 
 
+def forget_amplitudes() -> None:
+    """Give back what is kept for further tables, some MiB that a process with one finger needs no more."""
+    _amplitudes.cache_clear()
+
+
 def _solve(matrix: Extended, right: Extended) -> Extended:
     """Solve many small systems by Gauss-Jordan elimination with scaled rows (numpy solves no long doubles)."""
     scale = 1.0 / np.abs(matrix).max(axis=2, keepdims=True)

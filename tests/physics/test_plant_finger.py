@@ -139,3 +139,12 @@ def test_array_noise_offset_steps_and_seed():
     np.testing.assert_allclose(np.remainder(readings / 0.01 + 0.5, 1.0), 0.5, atol=1e-6)
     again = TactileArray(FingerShape(), gain=2.0, offset=0.5, noise=0.02, resolution=0.01, seed=3)
     np.testing.assert_array_equal(again.read(0.0, 1.3, 5e-3, out), readings[0])
+
+
+def test_elements_equally_deep_share_a_pattern(perfect):
+    elements = np.array(perfect.shape.angles_rad)
+    deeper = TactileArray(FingerShape(depth_scatter_m=1e-9))
+    assert perfect._rubber.strain.shape[2] == 1 and deeper._rubber.strain.shape[2] == len(elements)
+    for load, angle in ((5.0, 1.29), (300.0, elements[3])):
+        one, each = (array.strain(load, angle, 6e-3) for array in (perfect, deeper))
+        np.testing.assert_allclose(one, each, atol=1e-5 * np.abs(one).max())

@@ -18,6 +18,7 @@ from sioms.protocol.flags import AnalogStatus, NodeClass, Request
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description
 from sioms.sdk.driver import Refusal, TickDriver
+from sioms.tactile import cylinder
 from sioms.tactile.quality import Quality
 from sioms.tactile.sensing import CHANNELS
 
@@ -80,6 +81,14 @@ def test_shape_is_published_beside_raw_and_strain(bench, hand):
     assert felt["load"] == pytest.approx(200.0, rel=0.05)
     assert felt["radius"] == pytest.approx(6e-3, rel=0.4)
     np.testing.assert_allclose(strain.data, -0.03 * raw.data, atol=1.5e-3)
+
+
+def test_what_only_the_tables_needed_is_given_back(bench, hand):
+    body = cylinder.Cylinder(9.6e-3, 12.7e-3, 0.499)
+    cylinder.respond(body, np.arange(4.0), 0.01)  # tables of the file's own body may be there already
+    assert cylinder._amplitudes.cache_info().currsize
+    bench.make(SimTactile, "tactile0", table())
+    assert cylinder._amplitudes.cache_info().currsize == 0
 
 
 def test_load_of_a_force_sensor_is_used_while_it_is_there(bench, hand):
