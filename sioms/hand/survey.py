@@ -35,7 +35,10 @@ COLUMNS = (
 """Of a recording, as ``sioms reconcile hand`` reads them."""
 PSI, PHI = 1.0, (1.0, 2.1)
 """Directions of the line of contacts from minus to plus [rad], and angles of the fingers [rad], of a survey."""
-SETTLED_S = 1.8  # under each force: while the damper still moves, the joints' damping bears a part of it
+SETTLED_S = 1.2  # under each force: while the damper still moves, the joints' damping bears a part of it
+MEAN_S, DRAGGED_S = 1.0, 0.3
+"""How long what is told is averaged in a hold, and while fingers slide [s]: forces and commands swing by some per cent
+about once a second, and a drive that moves bears by its damping what its stiffness does not."""
 DRAG, DRAG_S = 5e-3, 0.6  # speed at which fingers are dragged along a clamped bar [m/s], and for how long first
 TRIES = 3  # grasps that fail one after the other
 #: What a hand's devices tell by themselves: x1, y1, th1, x2, y2, th2 as the encoders read them, places, loads, the same
@@ -185,7 +188,7 @@ class Survey(Skills):
             while self.now.time_s - begun_s < DRAG_S:
                 yield from self._follow(along, force)
             for finger in (1.0, 2.0):
-                row = yield from self._record(force, told, number, along)
+                row = yield from self._record(force, told, number, along, DRAGGED_S)
                 self.rows.append([*row[:-1], finger])
         yield from self._open()
         return list(middle)
@@ -207,21 +210,22 @@ class Survey(Skills):
             yield from self._follow((0.0, 0.0, math.copysign(min(rate, 3.0 * abs(left)), left), 0.0, 0.0, 0.0), force)
 
     def _record(
-        self, force: float, told: Told, number: int, along: Sequence[float] = STILL
+        self, force: float, told: Told, number: int, along: Sequence[float] = STILL, time_s: float = MEAN_S
     ) -> Generator[Setpoint, Reading, list[float]]:
-        """Average frames while the hand keeps still, or slides evenly; return a row.
+        """Average what is told for a time [s] while the hand keeps still, or slides evenly; return a row.
 
         Raises:
-            Failed: a finger is doubtful in more than half of them.
+            Failed: a finger is doubtful in more than half of the frames.
         """
-        self.state, count = State.SENSE, self.manner.frames
+        self.state, begun_s, count = State.SENSE, self.now.time_s, 0
         frames = []
-        for _ in range(2 * count):
+        while self.now.time_s - begun_s < time_s or count < self.manner.frames:
             yield from self._follow(along, force)
+            count += 1
             one, two = self.now.fingers
             if one.touched and two.touched and not one.doubt and not two.doubt:
                 frames.append(list(told()))
-        if len(frames) < count:
+        if len(frames) < count // 2:
             yield from self._sense(force)  # says which finger, and why
         mean = np.mean(frames or [[math.nan] * 20], axis=0)
         thing = float(self.thing.kind), float(self.thing.number), self.thing.size_m

@@ -68,7 +68,8 @@ def test_a_survey_records_grasps_that_close_on_the_object(tmp_path: Path) -> Non
 
     found = gaps(from_table({"hand": {}}, "x")[0].base, read)
     assert np.max(np.abs(found.along)) < 1.5e-4 and np.max(np.abs(found.across)) < 3e-4
-    assert np.max(np.abs(found.drive)) < 0.02 and np.max(np.abs(found.wrist)) < 0.05
+    assert np.max(np.abs(found.wrist)) < 0.05
+    assert np.max(np.abs(found.drive)) < 2e-4  # of 0.8 rad: while the damper still moves, more
 
 
 def test_fingers_that_are_dragged_along_a_clamped_bar_tell_friction_under_each_load(tmp_path: Path) -> None:
