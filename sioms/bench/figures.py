@@ -42,7 +42,7 @@ class Summary:
         ordered = sorted(samples)
         last = len(ordered) - 1
         scale = UNITS.get(unit, 1.0)
-        return cls(len(ordered), {n: ordered[min(last, int(p * len(ordered)))] * scale for n, p in PERCENTILES})
+        return cls(len(ordered), {n: float(ordered[min(last, int(p * len(ordered)))] * scale) for n, p in PERCENTILES})
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,7 +63,7 @@ class Bar:
 
     def met(self, found: float) -> bool:
         """Tell whether a figure reaches it."""
-        return found >= self.limit if self.at_least else found <= self.limit
+        return bool(found >= self.limit if self.at_least else found <= self.limit)  # of numpy's, too
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,7 +148,9 @@ class Report:
         bars: Sequence[Bar] = (), notes: str = "",
     ) -> Figure:  # fmt: skip
         """Add a figure of one number."""
-        return self._add(Figure(self._bench, name, unit, value=value, cpu=cpu or {}, bars=tuple(bars), notes=notes))
+        return self._add(
+            Figure(self._bench, name, unit, value=float(value), cpu=cpu or {}, bars=tuple(bars), notes=notes)
+        )
 
     def note(self, text: str) -> None:
         """Print a line between the figures."""

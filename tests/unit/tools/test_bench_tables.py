@@ -3,6 +3,8 @@
 import json
 from pathlib import Path
 
+import numpy as np
+
 from sioms.bench.figures import Bar, Report
 from sioms.bench.tables import markdown
 
@@ -37,3 +39,14 @@ def test_a_run_is_a_line_of_a_file(tmp_path: Path) -> None:
     assert (first["seed"], second["seed"]) == (1, 2)
     assert first["missed"] == ["deaths: halt"] and first["notes"] == ["late"]
     assert first["figures"]["deaths: stops lost"] == 0 and first["figures"]["deaths: halt"]["max"] == 30.0
+
+
+def test_numbers_of_numpy_are_written_like_others(tmp_path: Path) -> None:
+    report = Report()
+    report.begin("hand", "hand")
+    report.samples("angle", list(np.array([1, 2], dtype=np.int64)), "deg", bars=[Bar("max", 3.0)])
+    report.value("share", np.float32(50.0), bars=[Bar("value", 40.0, True)])  # type: ignore[arg-type]
+    report.write(str(tmp_path / "a.json"))
+    one, two = json.loads((tmp_path / "a.json").read_text())["figures"]
+    assert one["percentiles"]["max"] == 2 and one["bars"][0]["met"] is True
+    assert two["value"] == 50.0 and two["bars"][0]["met"] is True
