@@ -13,6 +13,7 @@ from scipy.stats import binom
 from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
+from sioms.reconcile.controlled import foreign
 from sioms.reconcile.disturbance import disturbance
 from sioms.reconcile.effect import Array
 from sioms.reconcile.effects.smooth import CONSTANT, LAWS
@@ -29,7 +30,7 @@ from sioms.reconcile.locate import Spectrum, locate, spectra
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.plausible import leans
-from sioms.reconcile.prepare import TIMES, Options, Prepared
+from sioms.reconcile.prepare import TIMES, Options, Prepared, searched
 from sioms.reconcile.rate import SAMPLE_TIME, instead, remark
 from sioms.reconcile.records import Session
 from sioms.reconcile.refine import runs_away
@@ -100,6 +101,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     if runs_away(found.fit.model):
         judged = replace(judged, refusals=(*judged.refusals, _of_inertia(nominal, found.fit.model)))
     missing = bool(terms) or bool(leaning) or disturbance or beyond or odd or bool(judged.refusals)
+    # what makes the force is a part of the model, too: with none of its mechanics missing it is not right
+    missing = missing or (not named and foreign(searched(ready.problem.session), nominal))
     blindly = ready.blind and any(e.name == PAYLOAD for e in named)
     said = outcome(bool(named), missing, bool(open_rivals) or blindly)
     gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)

@@ -33,6 +33,13 @@ def runs_the_loop(session: Session, model: AxisModel) -> bool:
     )
 
 
+def foreign(session: Session, model: AxisModel) -> bool:
+    """Say whether the controller of a model leaves more of some recorded force than it can: then the model is not that
+    of what was recorded, whatever its mechanics are.
+    """
+    return model.controller is not None and any(beyond_feedback(r, model) > FOREIGN for r in session.records)
+
+
 def beyond_feedback(r: Record, model: AxisModel) -> float:
     """Size of the recorded force that the controller does not explain, over the size of the force; 0 without a command.
 

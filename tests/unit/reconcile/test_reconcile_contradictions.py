@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sioms.reconcile.axis import analyse
 from sioms.reconcile.command import main
 from sioms.reconcile.command.damaged import COLUMNS, damaged, write
 from sioms.reconcile.contradictions import check_law, usable
@@ -18,6 +19,7 @@ from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.verdict import Outcome
 from sioms.reconcile_selftest.damage import Public
 from sioms.reconcile_selftest.damage_within import EVERY
 
@@ -115,6 +117,22 @@ def test_a_controller_that_has_nothing_to_do_with_the_force_is_of_another_axis()
     other = replace(model, controller=replace(model.controller, k=4.0 * model.controller.k))
     with pytest.raises(BadInputError, match="leave out"):
         check_law(session, other)
+
+
+def test_where_the_controller_makes_another_force_something_is_missing() -> None:
+    _, model = given()
+    assert model.controller is not None
+    size = 0.1 / model.controller.k
+
+    def spiked(r: Record) -> Record:
+        """Put a spike of a tenth of the force into every fiftieth row of the command."""
+        assert r.command is not None
+        spikes = size * float(np.quantile(np.abs(r.force), 0.98)) * (np.arange(len(r)) % 50 == 0)
+        return replace(r, command=r.command + spikes)
+
+    found = analyse(every(spiked), model, Options(pictures=False))
+    assert found.outcome is Outcome.UNEXPLAINED and not found.effects
+    assert any("does not make the recorded force" in note for note in found.notes)
 
 
 def test_one_record_of_another_rate_is_found_among_the_others() -> None:
