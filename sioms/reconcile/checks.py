@@ -7,6 +7,7 @@ from scipy.ndimage import maximum_filter1d, uniform_filter1d
 
 from sioms.reconcile.controlled import FOREIGN, beyond_feedback
 from sioms.reconcile.effect import Array
+from sioms.reconcile.mistakes import in_another_unit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.timing import LEAST_SAMPLES, MOST
@@ -16,15 +17,6 @@ LEAST_COUNTS = 20
 LEAST_TOTAL_S = 2.0
 #: A channel that is so many times another one that should be like it is in another unit.
 OTHER_UNIT = 30.0
-#: Mistakes of units by their factor, which is met within a tenth.
-MISTAKES = {
-    1000.0: "m against mm, N against mN, A against mA",
-    180.0 / np.pi: "degrees against radians",
-    2.0 * np.pi: "turns against radians",
-    25.4: "inches against millimetres",
-    39.37: "inches against metres",
-    9.80665: "kgf against N, or ten",
-}
 #: Measured may be so many times the commanded force; samples it is judged on, their share of the largest force, and
 #: seconds of a mean.
 FORCE_SCALE, LEAST_SLOW, SLOW_SHARE, SLOW_S = 1.33, 200, 0.8, 0.05
@@ -120,14 +112,6 @@ def check_record(r: Record, model: AxisModel) -> None:
 def at_limit(r: Record, model: AxisModel) -> float:
     """Return the share of the samples at the limit of the controller; 0 where none is known."""
     return 0.0 if model.controller is None else float(np.mean(np.abs(r.force) >= 0.999 * model.controller.limit))
-
-
-def in_another_unit(factor: float) -> str:
-    """Say what a factor between two numbers that should be alike looks like."""
-    size = max(abs(factor), 1.0 / abs(factor))
-    known = next((f" ({said})" for f, said in MISTAKES.items() if 0.9 < size / f < 1.1), "")
-    shown = f"{10.0 ** round(np.log10(size)):g}" if size > 100.0 else f"{size:.3g}"
-    return f"is one of them in another unit, by a factor of {shown}{known}?"
 
 
 def _check_time(r: Record, time: Array, dt: float) -> None:

@@ -12,10 +12,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from sioms.reconcile.checks import in_another_unit
 from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.fit import Problem
+from sioms.reconcile.mistakes import in_another_unit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record
 from sioms.reconcile.screen import Motion, bandwidth, dead_band, direction, low_passed, smoothed_motion

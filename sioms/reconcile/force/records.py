@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.force.belief import Floats, Loads, readings
+from sioms.reconcile.mistakes import in_another_unit
 from sioms.reconcile.sensors.effect import SensorModel
 
 LEAST_ROWS = 40
-FACTOR = 5.0  # a component off by more is in another unit
+FACTOR = 2.0  # a component off by more is in another unit: lbf for N make 4.4
 LEAST_RANGE, MOST_RANGE = 0.01, 5.0  # shares of full range between which the largest load lies
 LEAST_WHOLE = 0.8  # share of the rows that must hold numbers
 LONG_REST, REST_S = (
@@ -26,6 +27,7 @@ WELL_LIKE, EXCHANGED = (
     0.98,
 )  # below the first with its own load and above the second with another's: columns are exchanged
 LEAST_LIKE = 0.3  # correlation of readings and loads below which it is another sensor
+LOADED = 0.05  # of full range, root mean square about the mean: a reading that follows no such load is broken
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -83,7 +85,8 @@ def check(r: ForceRecords, model: SensorModel) -> list[str]:
                 f"read loads: {name} has {int(bad[:, column].sum())} of {len(bad)} values that are no numbers; needs "
                 f"numbers in {100 * LEAST_WHOLE:.0f} % of the rows"
             )
-    if np.any(np.diff(r.time)[np.diff(r.record) == 0] < 0.0):
+    steps = np.diff(r.time)[np.diff(r.record) == 0]
+    if np.any(steps < 0.0) or not np.any(steps > 0.0):
         raise BadInputError("read loads: time does not rise; needs seconds in the order of recording")
     notes: list[str] = []
     step = np.where(np.diff(r.record) == 0, np.diff(r.time), 0.0)
@@ -120,7 +123,7 @@ def _check_match(r: ForceRecords, model: SensorModel, moved: NDArray[np.bool_]) 
     loads = Loads(r.load / model.base.full, r.time - r.time[0], np.zeros(len(r.time)), r.record)
     said = readings(model.belief(), loads) * model.base.full
     said, got = said - said.mean(0), r.reading - r.reading.mean(0)
-    like = []
+    like, broken = [], list[str]()
     for i in np.flatnonzero(moved):
         n, s, g = r.names[i], said[:, i], got[:, i]
         correlation = float(s @ g / np.sqrt((s @ s) * (g @ g) + 1e-300))
@@ -128,6 +131,7 @@ def _check_match(r: ForceRecords, model: SensorModel, moved: NDArray[np.bool_]) 
         if abs(correlation) < WELL_LIKE:
             _raise_exchanged(r, int(i), got[:, i])
         if abs(correlation) < LEAST_LIKE:
+            broken += [n] if float(np.std(s)) > LOADED * model.base.full[i] else []
             continue
         scale = float(s @ g / (s @ s))
         if scale < 0.0:
@@ -136,13 +140,18 @@ def _check_match(r: ForceRecords, model: SensorModel, moved: NDArray[np.bool_]) 
             )
         if not 1.0 / FACTOR < scale < FACTOR:
             raise BadInputError(
-                f"compare readings with loads: {n} reads {scale:.4g} times its load (about "
-                f"{10.0 ** round(np.log10(scale)):g}); check the units (N against mN or kN, N m against N mm)"
+                f"compare readings with loads: {n} reads {scale:.4g} times its load; {in_another_unit(scale)} needs "
+                "both in one, and no sensor is off by so much: a scale that is not known stands in columns.toml"
             )
     if np.median(like) < LEAST_LIKE:
         raise BadInputError(
             f"compare readings with loads: they agree to {100 * float(np.median(like)):.0f} % (correlation); it is "
             "another sensor, or columns are exchanged"
+        )
+    if broken:
+        raise BadInputError(
+            f"compare readings with loads: {' and '.join(broken)} of the readings do not follow the own load "
+            f"(correlation below {LEAST_LIKE:g}), the others do; is a channel broken, or of another run?"
         )
 
 

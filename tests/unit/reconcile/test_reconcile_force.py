@@ -277,7 +277,8 @@ def _other(a: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize(("change", "said"), [
-    (times("fx", 1000.0), "(about 1000)"),
+    (times("fx", 1000.0), "by a factor of 1000"),
+    (times("fx", 1.0 / 4.448), "lbf against N"),
     (times("load_tz", 1000.0), "times its full_range"),
     (times("fx", -1.0), "turned round"),
     (_nan, "reading fy has 288 of 864 values that are no numbers"),
@@ -285,8 +286,10 @@ def _other(a: dict[str, np.ndarray]) -> None:
     (_short, "rows are too few"),
     (_unloaded, "no load changes"),
     (_other, "it is another sensor"),
+    (lambda a: a.update(fx=np.random.default_rng(2).permutation(a["fx"])), "fx of the readings do not follow"),
     (lambda a: a.pop("fx"), "no column 'fx'"),
     (times("t", -1.0), "time does not rise"),
+    (times("t", 0.0), "time does not rise"),
 ])  # fmt: skip
 def test_what_cannot_be_used_is_refused_with_a_reason(
     folder: Path,
