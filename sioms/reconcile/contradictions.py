@@ -24,6 +24,8 @@ from sioms.reconcile.thresholds import JUMP_COUNTS, JUMP_TIMES, LAWLESS, NOISY, 
 SHIFTS = (*range(2, 31), 40, 50, 60, 80, 100)
 #: A law that holds only otherwise leaves at most this share of what it leaves as the columns are named.
 BETTER = 0.2
+#: Rows at least in which a position is new, for their distances to tell anything.
+LEAST_NEW = 20
 #: Of the samples so many are in records that can be used; else none is.
 ENOUGH = 0.5
 
@@ -71,6 +73,7 @@ def check_one(record: Record, r: Record, model: AxisModel) -> None:
     check_record(record, model)
     where = f"read record {record.name}"
     _check_rows(r, where)
+    _check_held(r, where)
     _check_smooth(r, model, where)
     _check_order(r, model, where)
     _check_jumps(r, model, where)
@@ -88,6 +91,16 @@ def _check_rows(r: Record, where: str) -> None:
                 f"{where}: {100 * np.mean(pairs):.0f} % of the rows come twice, and there is no time that would tell "
                 "them apart; needs every sample once, or a time column"
             )
+
+
+def _check_held(r: Record, where: str) -> None:
+    """Find a position that is new at every so many rows only: its sensor, or what reads it, is slower than the log."""
+    new = np.flatnonzero(np.diff(r.position))
+    if len(new) >= LEAST_NEW and (every := int(np.gcd.reduce(np.diff(new)))) > 1:
+        raise BadInputError(
+            f"{where}: the position is new in every row of {every} only, and repeated in between; needs the rows in "
+            "which it is new, with their sample time in the model"
+        )
 
 
 def _check_smooth(r: Record, model: AxisModel, where: str) -> None:
