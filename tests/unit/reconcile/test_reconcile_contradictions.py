@@ -14,9 +14,10 @@ from sioms.reconcile.axis import analyse
 from sioms.reconcile.command import main
 from sioms.reconcile.command.damaged import COLUMNS, damaged, write
 from sioms.reconcile.contradictions import check_law, usable
+from sioms.reconcile.controlled import beyond_feedback
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_data, read_model
-from sioms.reconcile.model import AxisModel
+from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.verdict import Outcome
@@ -118,6 +119,23 @@ def test_a_controller_that_has_nothing_to_do_with_the_force_is_of_another_axis()
     other = replace(model, controller=replace(model.controller, k=4.0 * model.controller.k))
     with pytest.raises(BadInputError, match="leave out"):
         check_law(session, other)
+
+
+def test_interpolated_rows_are_not_what_the_controller_made() -> None:
+    """A busy machine loses ticks, a fifth of them here; with 0.8 N for a count what fills them in obeys no law."""
+    gains = Controller(825e3, -0.914, 0.0, 0.0, 0.0, 60.0, 0.0)
+    model = replace(given()[1], resolution=1e-6, controller=gains)
+    t = np.arange(5000) * model.sample_time_s
+    position = 1e-6 * np.rint(1e4 * np.sin(3.0 * t))
+    command = 0.01 * np.sin(3.0 * t + 1e-4)
+    e = command - position
+    force = gains.k * (e + gains.kz * np.concatenate([e[:1], e[:-1]]))
+    whole = Record("whole", position, force, command=command)
+    kept = np.random.default_rng(4).random(len(t)) > 0.2
+    filled = replace(whole, filled=~kept, **{n: np.interp(t, t[kept], a[kept]) for n, a in whole.arrays().items()})
+    assert beyond_feedback(whole, model) < 1e-6
+    assert beyond_feedback(filled, model) < 0.01
+    assert beyond_feedback(replace(filled, force=-filled.force), model) > 1.0, "what was recorded counts"
 
 
 def test_where_the_controller_makes_another_force_something_is_missing() -> None:
