@@ -30,6 +30,7 @@ from sioms.reconcile.refine import ahead, loops, nearest
 from sioms.reconcile.refine import settled as settled_numbers
 from sioms.reconcile.refuse import bursts, smoother_share
 from sioms.reconcile.search import Found, Searcher, Step
+from sioms.reconcile.second import TWO_MASSES, second
 from sioms.reconcile.thresholds import (
     ABOUT,
     AXIS,
@@ -105,6 +106,8 @@ def _foreseen(s: Searched, o: Options) -> Searched:
     if not loops(problem, nominal) and (plain := nearest(problem, fit.model, earlier)) is not None:
         back = settled_numbers(problem, nominal, refit(problem, plain, searcher.frozen), searcher.frozen)
         fit = back if ahead(problem, back.model) < ahead(problem, fit.model) else fit
+    if not loops(problem, nominal) and TWO_MASSES in searcher.names:
+        fit = second(problem, fit, s.ready.model, searcher.frozen) or fit
     if fit is found.fit:
         return s
     gone = [n for n in found.fit.model.effects if n not in fit.model.effects]

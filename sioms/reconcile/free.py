@@ -114,6 +114,13 @@ def errors(problem: Problem, model: AxisModel, horizon_s: float) -> Array:
     return np.concatenate(off) if off else np.empty(0)
 
 
+def moved(problem: Problem, model: AxisModel, horizon_s: float) -> Array:
+    """Return the measured motion over the same segments about what a constant speed explains, shape (n,), [{x}]."""
+    parts = [s.record.position[s.start : s.stop] for s in _segments(problem, model, horizon_s)]
+    off = [_beside(y, np.vander(np.arange(len(y), dtype=np.float64), 2)) for y in parts]
+    return np.concatenate(off) if off else np.empty(0)
+
+
 def _over(
     problems: tuple[Problem, Problem],
     models: tuple[AxisModel, AxisModel],

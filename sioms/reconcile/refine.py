@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from sioms.reconcile.effect import Array
-from sioms.reconcile.engine.fit import BASE, fitted, get, put
+from sioms.reconcile.engine.fit import BASE, Free, fitted, get, put
 from sioms.reconcile.fit import Fit, Problem, closed_errors, free_parameters, refit
 from sioms.reconcile.free import HORIZONS_S, errors
 from sioms.reconcile.model import AxisModel
@@ -100,8 +100,12 @@ def _widened(problem: Problem, fit: Fit, frozen: Sequence[str]) -> Fit:
 
 def _flown(problem: Problem, model: AxisModel) -> AxisModel:
     """Fit the refined numbers to free runs over the longest segments."""
-    horizon = _longest(problem, model)
     free = tuple(f for f in free_parameters(model) if f.effect == BASE)
+    return flown(problem, model, free, _longest(problem, model))
+
+
+def flown(problem: Problem, model: AxisModel, free: tuple[Free, ...], horizon: float) -> AxisModel:
+    """Fit some numbers of a model to free runs over segments of a length."""
 
     def off(m: AxisModel) -> Array:
         return errors(problem, m, horizon)
@@ -113,9 +117,9 @@ def _flown(problem: Problem, model: AxisModel) -> AxisModel:
     def slopes(at: Array, r: Array) -> Array:
         columns = []
         for i, f in enumerate(free):
-            moved = at.copy()
-            moved[i] += SMALL * f.scale
-            columns.append((off(put(model, free, moved)) / size - r) / SMALL)
+            moved, step = at.copy(), SMALL if at[i] + SMALL * f.scale <= f.upper else -SMALL
+            moved[i] += step * f.scale
+            columns.append((off(put(model, free, moved)) / size - r) / step)
         return np.stack(columns, axis=1)
 
     return fitted(model, free, lambda m: off(m) / size, slopes, STEPS, TOLERANCE).model
