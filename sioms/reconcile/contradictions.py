@@ -118,15 +118,15 @@ def _check_smooth(r: Record, model: AxisModel, where: str) -> None:
 
 
 def _check_order(r: Record, model: AxisModel, where: str) -> None:
-    """Find neighbours that have changed places: a motion is rougher with them exchanged, not smoother."""
-    a = r.position
-    if np.ptp(a) < 8.0 * model.resolution:
-        return
-    given = _roughness(a)
-    for first in (0, 1):
-        if _roughness(_exchanged(a, first)) < SMOOTHER * given:
+    """Find neighbours that have changed places: a motion is rougher with them exchanged, not smoother; so is what is
+    commanded, also where an encoder hardly counts.
+    """
+    for name, a in (("position", r.position), ("command", r.command)):
+        if a is None or np.ptp(a) < 8.0 * model.resolution:
+            continue
+        if min(_roughness(_exchanged(a, first)) for first in (0, 1)) < SMOOTHER * _roughness(a):
             raise BadInputError(
-                f"{where}: the position is smoother with every two neighbouring rows exchanged; the rows are in no "
+                f"{where}: the {name} is smoother with every two neighbouring rows exchanged; the rows are in no "
                 "order of time"
             )
 

@@ -87,6 +87,7 @@ def test_records_that_agree_with_themselves_pass() -> None:
         (lambda r: replace(r, position=late(r.position, 20)), "the position is taken 20 rows later"),
         (lambda r: replace(r, position=np.repeat(r.position[::4], 4)[: len(r)]), "every row of 4 only"),
         (rows(lambda n: exchanged(np.arange(n), 0)), "exchanged; the rows are in no order of time"),
+        (lambda r: replace(r, command=exchanged(np.asarray(r.command), 0)), "the command is smoother with"),
         (rows(lambda n: exchanged(np.arange(n), 1)), "exchanged; the rows are in no order of time"),
         (lambda r: replace(r, command=-r.command), "turned round"),
         (lambda r: replace(r, position=r.position % (0.3 * np.ptp(r.position))), "leaps"),
