@@ -296,8 +296,9 @@ class TickDriver(Driver):
         A LinkError says that the device is gone: the kit tells the readers and opens it again.
 
         Args:
-            now_ns: the scheduled time of this tick [ns, CLOCK_MONOTONIC], not the time it began. At 250 Hz or less a
-                tick may come early after a stop, a quarter of a period after the last one at the soonest.
+            now_ns: the scheduled time of this tick [ns, CLOCK_MONOTONIC], not the time it began. After a stop a tick
+                may come early, at 250 Hz or less, or be for the time it begins when it is late; a quarter of a period
+                after the last one at the soonest.
         """
 
     def write_outputs(self, block: BlockSpec, channels: Sequence[int], values: Sequence[float]) -> None:

@@ -485,6 +485,8 @@ class Runtime:
         self.statistics.skipped += (expired - 1) * periods
         scheduled_ns = self._scheduled_ns
         engine, slack_ns = self.engine, self._slack_ns
+        if isinstance(engine, TickEngine):
+            self._line_due_ns = None  # an early tick that has not come by now comes with this one
         began_ns = time.monotonic_ns()
         self.tick += 1
         self._look_around(began_ns)

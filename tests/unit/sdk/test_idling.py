@@ -185,6 +185,23 @@ def test_a_stop_that_an_early_tick_heeds_has_no_other_at_once(tenths: int, *, an
         world.close()
 
 
+def test_an_early_tick_that_did_not_come_comes_with_that_of_the_grid() -> None:
+    """Its timer has expired, and is looked at behind the other one."""
+    made: list[World] = []
+    with own_time(made):
+        world = rested(SimAxes, AXES, made, used=True, ticks=2)
+        runtime = world.runtime
+        CLOCK.now_ns = runtime._scheduled_ns + runtime.period_ns // 3
+        runtime._tick_soon()
+        assert runtime._line_due_ns
+        CLOCK.now_ns = runtime._scheduled_ns + runtime.period_ns
+        runtime._tick_on_time(1)
+        before = runtime.tick
+        runtime._on_line_timer()
+        assert runtime.tick == before
+        world.close()
+
+
 def test_seldom_and_idle_ticks_are_steps() -> None:
     """Slack before the tick, tick, rest: nothing of it needs the loop, until something happens."""
     made: list[World] = []
