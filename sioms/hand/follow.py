@@ -25,10 +25,11 @@ class Follower:
 
     Args:
         gains: of the laws; the damper's are the driver's own.
+        most: fastest rates of the axes [m/s, rad/s]: the node refuses what is beyond. Shape (6,), or none.
     """
 
-    def __init__(self, gains: Gains = Gains()) -> None:  # noqa: B008  # immutable
-        self._gains, self._controller = gains, Controller(gains)
+    def __init__(self, gains: Gains = Gains(), most: Sequence[float] = (math.inf,) * 6) -> None:  # noqa: B008
+        self._gains, self._controller, self._most = gains, Controller(gains), most
 
     def orders(self, setpoint: Setpoint, now: Sequence[float], force: float, sample_s: float) -> list[Order]:
         """Return what the six axes are to do until the next tick.
@@ -50,7 +51,11 @@ class Follower:
                 found.append((axis, True, setpoint.force))
             else:
                 found.append((axis, False, self._controller.opening(to, rate, at, setpoint.force, touches=False)))
-        return found
+        return [self._bounded(*order) for order in found]
+
+    def _bounded(self, axis: int, presses: bool, value: float) -> Order:
+        most = self._most[axis]
+        return axis, presses, value if presses else min(max(value, -most), most)
 
 
 def standing() -> list[Order]:

@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--forces", type=positive, nargs="+", metavar="N",
-        help="internal forces of each grasp in newtons (default 0.5 1 1.8; with --slips 0.4 0.8 1.6 2.4)",
+        help="internal forces of each grasp in newtons (default 0.5 1 1.8; with --slips 0.4 0.8 1.2 1.8)",
     )  # fmt: skip
     parser.add_argument(
         "--slips", action="store_true",

@@ -12,6 +12,7 @@ skills are shown its own time, and their velocities are slowed down with it.
 from __future__ import annotations
 
 import errno
+import math
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack
@@ -82,10 +83,11 @@ class CellHand:
         self.model = _known(cell, f"{name}.model")
         self.hand: Hand = self.model.maps()
         self.manner = replace(MANNER, friction=min(MANNER.friction, self.model.friction))
-        self._follower = Follower(gains)
         self.seen: Callable[[Reading, Setpoint], None] | None = None
         with ExitStack() as stack:
             self._node: AxisNode = stack.enter_context(cell.open(name, "rw", 10.0, lease=lease_s / self.pace))
+            limits = [channel.limits.get("velocity", math.inf) for channel in self._node.info.channels]
+            self._follower = Follower(gains, [0.999 * limit / self.pace for limit in limits])
             self._fingers: list[Any] = [stack.enter_context(cell.open(f"{node}")) for node in fingers]
             for node in self._fingers:
                 if why := no_shape(node.name, [channel.name for channel in node.info.channels]):
