@@ -225,7 +225,6 @@ WITHIN: Mapping[str, Damage] = {
     "forces of two axes added": _two(_added),
     # one record of four
     "one record in other counts": _one_record(lambda r: {**r, "counts": 4 * r["counts"]}),
-    "one record with its force turned round": _one_record(lambda r: {**r, **{n: -r[n] for n in FORCES}}),
     "one record backwards": lambda p, other, rng: _one_record(lambda r: {n: a[::-1] for n, a in r.items()})(
         p.without_time(), other, rng
     ),
