@@ -57,8 +57,10 @@ of it."""
 HALTS: Final = 1
 STOPS: Final = 2
 """How axes brake: as those whose owner has gone, or latched."""
-MOMENT_NS: Final = 1_000_000
-"""How long the loop leaves the processor to devices that have yet to show that they brake."""
+MOMENT_NS: Final = 2_000_000
+"""How long the loop leaves the processor to devices that have yet to show that they brake, and to the daemon and the
+client, who have the answer by then.
+"""
 RESTED: Final = 1
 STIRS: Final = 2
 """What the loop has to hear: the device has been at rest for long; it has been idle and is at rest no more."""
