@@ -40,7 +40,6 @@ MEAN_S, DRAGGED_S = 1.0, 0.3
 """How long what is told is averaged in a hold, and while fingers slide [s]: forces and commands swing by some per cent
 about once a second, and a drive that moves bears by its damping what its stiffness does not."""
 DRAG, DRAG_S = 5e-3, 0.6  # speed at which fingers are dragged along a clamped bar [m/s], and for how long first
-BALANCE = 0.03  # velocity along the line of contacts for a difference of both loads [m/(s N)]
 TRIES = 3  # grasps that fail one after the other
 #: What a hand's devices tell by themselves: x1, y1, th1, x2, y2, th2 as the encoders read them, places, loads, the same
 #: joints as commanded, and the wrists' forces fx1, fy1, fx2, fy2 [m, rad, N]; nan where not known.
@@ -184,21 +183,15 @@ class Survey(Skills):
         psi, sign = self._goal[2], 1.0 if number % 2 else -1.0
         along = (-sign * DRAG * math.sin(psi), sign * DRAG * math.cos(psi), 0.0, 0.0, 0.0, 0.0)
         for force in setting.loads:
-            yield from self._balance(STILL, force, SETTLED_S)
-            yield from self._balance(along, force, DRAG_S)
+            yield from self._settle(force, 0.5)
+            begun_s = self.now.time_s
+            while self.now.time_s - begun_s < DRAG_S:
+                yield from self._follow(along, force)
             for finger in (1.0, 2.0):
                 row = yield from self._record(force, told, number, along, DRAGGED_S)
                 self.rows.append([*row[:-1], finger])
         yield from self._open()
         return list(middle)
-
-    def _balance(self, along: Sequence[float], force: float, time_s: float) -> Generator[Setpoint, Reading, None]:
-        """Move for a time [s] while both fingers come to bear alike: what is clamped gives way to neither."""
-        u, v, begun_s = math.cos(self._goal[2]), math.sin(self._goal[2]), self.now.time_s
-        while self.now.time_s - begun_s < time_s:
-            one, two = self.now.fingers
-            shift = BALANCE * (two.force - one.force)
-            yield from self._follow((along[0] + shift * u, along[1] + shift * v, *along[2:]), force)
 
     def _take(self, middle: Sequence[float], phi: tuple[float, float]) -> Generator[Setpoint, Reading, None]:
         """Roll the fingers, and close lightly about a place."""
