@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 import os
 from _socket import CMSG_SPACE, SCM_RIGHTS, SHUT_RDWR, SO_PEERCRED, SO_RCVTIMEO, SOL_SOCKET, socket
-from _thread import allocate_lock
+from _thread import allocate_lock, get_ident
 from struct import pack, unpack
 from time import monotonic
 
@@ -57,13 +57,14 @@ class Call:
         limit_s: the time-out that the other side has been given [s], None = it may take for ever.
         enough: tells of an overdue answer whether it is not needed any more.
         through: the process that has to act before it can be answered, beside the one that answers; 0: none.
+        number: with which it is sent, known before it is; 0: it has not come to that.
 
     Raises:
         TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken
             client.
     """
 
-    __slots__ = ("ahead", "enough", "limit_s", "message", "through", "what")
+    __slots__ = ("ahead", "enough", "limit_s", "message", "number", "through", "what")
 
     def __init__(
         self,
@@ -81,6 +82,7 @@ class Call:
         self.ahead = ahead
         self.limit_s = seconds(what, limit_s)
         self.enough = enough
+        self.number = 0
 
     @property
     def first_look_s(self) -> float:
@@ -147,7 +149,7 @@ class Channel:
         self._behind = behind
         self._number = 0
         self._mutex = allocate_lock()
-        self._reading = False
+        self._reading = 0
         self._abandoned: set[int] = set()
         self._answers: dict[int, tuple[list, list[int]]] = {}  # type: ignore[type-arg]
         self._waiting: dict[int, object] = {}
@@ -179,13 +181,12 @@ class Channel:
             OSError: the refusal, with its errno and sentence; EIO when the other side is gone,
                 ETIMEDOUT when it does not answer within the time-out and what ``overdue`` adds to it.
         """
-        number = 0
         try:
-            number = self.send(call)
-            return self.wait(number, call)
-        except KeyboardInterrupt:
-            if number:
-                self._abandon(number)
+            self.send(call)
+            return self.wait(call.number, call)
+        except KeyboardInterrupt:  # also of one that comes when the request has been sent, and before ``send`` returns
+            if call.number:
+                self._abandon(call.number)
             raise
 
     def short_call(self, arguments: tuple[Any, ...], call: Callable[[], Call]) -> Any:
@@ -200,15 +201,18 @@ class Channel:
         Raises:
             OSError: as ``call``.
         """
-        number = self._lead()
-        if not number:
-            return self.call(call()).value
+        number = 0
         try:
+            number = self._lead()
+            if not number:
+                return self.call(call()).value
             message = self._exchange(number, arguments, call)
             if message is None:
                 return self.wait(number, call(), 0.0 if number in self._answers else self._timeout).value
         except KeyboardInterrupt:
-            self._abandon(number)
+            self._read_no_more()
+            if number:
+                self._abandon(number)
             raise
         self.acknowledged(message[5])
         return message[3]
@@ -221,7 +225,7 @@ class Channel:
             is_late = 0 < self.keepalive_s < self._timeout - _STEP_S
             if self._reading or self._ended is not None or not self._timeout or is_late:
                 return 0
-            self._reading = True
+            self._reading = get_ident()
             self._number += 1
             return self._number
 
@@ -247,7 +251,7 @@ class Channel:
             raise self._gone(error, "receive" if packet else call().what) from None
         finally:
             with self._mutex:
-                self._reading = False
+                self._reading = 0
                 self._pass_on()
 
     def _abandon(self, number: int) -> None:
@@ -269,7 +273,7 @@ class Channel:
             if self._ended is not None:
                 raise OSError(*self._ended)
             self._number += 1
-            number = self._number
+            number = call.number = self._number
             packet = call.message.packed(number)
             if len(packet) > MAX_PACKET:
                 raise OSError(errno.EMSGSIZE, f"{call.what}: {len(packet)} bytes in one message; at most {MAX_PACKET}")
@@ -324,6 +328,20 @@ class Channel:
 
     def wait(self, number: int, call: Call, waited_s: float = 0.0) -> Answer:
         """Wait for the answer to a request that was sent some time ago [s]."""
+        try:
+            return self._wait(number, call, waited_s)
+        except BaseException:
+            self._read_no_more()
+            raise
+
+    def _read_no_more(self) -> None:
+        """Let others read where a signal has ended this thread's reading between two steps."""
+        if self._reading == get_ident():
+            with self._mutex:
+                self._reading = 0
+                self._pass_on()
+
+    def _wait(self, number: int, call: Call, waited_s: float) -> Answer:
         due_s = monotonic() - waited_s + (call.limit_s or 0.0)
         deadline = None if call.limit_s is None else due_s + call.first_look_s
         overdue: Overdue | None = None
@@ -335,7 +353,7 @@ class Channel:
                         raise OSError(*self._ended)
                     lead = not self._reading
                     if lead:
-                        self._reading = True
+                        self._reading = get_ident()
                     else:
                         turn = allocate_lock()
                         turn.acquire()
@@ -362,7 +380,7 @@ class Channel:
                 found = self._read(number, deadline)
             finally:
                 with self._mutex:
-                    self._reading = False
+                    self._reading = 0
                     self._pass_on()
             if found is not None:
                 return self.result(found)

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import _socket
 import contextlib
+import dis
 import errno
 import os
 import socket
+import sys
 import threading
 import time
 from _thread import allocate_lock
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import FrameType
 
 import pytest
 
@@ -354,3 +357,76 @@ def test_the_time_out_of_the_socket_is_set_once_for_all_writes(peer: Peer, monke
         peer.channel.wait(peer.channel._number, call)
         timeouts.append(peer.channel._timeout)
     assert set(timeouts) == {1.0}
+
+
+class Interrupt:
+    """Raises KeyboardInterrupt behind the n-th call, or entry, in the channel: there Python heeds signals."""
+
+    def __init__(self, at: int) -> None:
+        self.left = at
+        self.last: dict[FrameType, int] = {}
+
+    def __call__(self, frame: FrameType, event: str, argument: object) -> Interrupt | None:
+        if frame.f_globals.get("__name__") != "sioms.client.channel":
+            return None
+        frame.f_trace_opcodes = True
+        if event == "opcode":
+            before = self.last.get(frame, -1)
+            self.last[frame] = frame.f_lasti
+            if before >= 0 and dis.opname[frame.f_code.co_code[before]] in ("CALL", "CALL_FUNCTION_EX", "RESUME"):
+                self.left -= 1
+                if self.left == 0:
+                    raise KeyboardInterrupt
+        return self
+
+
+class Late:
+    """Answers requests, all but those that are cancelled, a moment after they have come."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.sock, self.asked, self.told, self.cancelled = peer.sock, list[int](), set[int](), set[int]()
+        threading.Thread(target=self.run, daemon=True).start()
+
+    def run(self) -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                waiting = [n for n in self.asked if n not in self.told | self.cancelled]
+                self.sock.settimeout(0.02 if waiting else 10.0)
+                try:
+                    packet = self.sock.recv(65536)
+                except TimeoutError:
+                    for number in waiting:
+                        self.told.add(number)
+                        self.sock.send(reply(number, "late"))
+                    continue
+                if not packet:
+                    return
+                verb, number, *arguments = decode(packet)
+                if verb == ClientVerb.CANCEL:
+                    self.sock.send(refusal(arguments[0], errno.ECANCELED, "cancelled"))
+                    self.cancelled.add(arguments[0])
+                    self.sock.send(reply(number, True))
+                else:
+                    self.asked.append(number)
+
+
+@pytest.mark.parametrize("short", [False, True])
+def test_an_interrupt_between_any_two_steps_leaves_nothing_behind(peer: Peer, *, short: bool) -> None:
+    """The channel goes on, and what nobody waits for is cancelled."""
+    call = lambda: Call("write", Write(1, 5.0, b"data"), limit_s=5.0)  # noqa: E731 - a new one for each request
+    late = Late(peer)
+    assert peer.channel.call(call()).value == "late"
+    at, interrupted, tracing = 0, True, sys.gettrace()
+    while interrupted:
+        at += 1
+        interrupted, before = False, len(late.asked)
+        sys.settrace(Interrupt(at))
+        try:
+            peer.channel.short_call((1, 1, 5.0, b"data"), call) if short else peer.channel.call(call())
+        except KeyboardInterrupt:
+            interrupted = True
+        finally:
+            sys.settrace(tracing)
+        assert peer.channel.call(call()).value == "late", f"interrupted at place {at}"
+        assert set(late.asked[before:-1]) <= late.cancelled | late.told, f"interrupted at place {at}"
+    assert at > 10 and late.cancelled
