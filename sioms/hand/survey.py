@@ -25,6 +25,7 @@ from sioms.hand.skills import STILL, Skills
 from sioms.hand.touch import Failed, Manner, Reading, Setpoint, State
 
 OTHER, DISK, BAR = 0, 1, 2
+MOST_M = 0.5  # of an object
 LOADS_N = (0.5, 1.0, 1.8)
 SLIPS_N = (0.4, 0.8, 1.2, 1.8)
 COLUMNS = (
@@ -52,7 +53,7 @@ class Thing:
 
     Args:
         kind: DISK, BAR or OTHER.
-        size_m: radius of a disk, width of a bar [m], > 0.
+        size_m: radius of a disk, width of a bar [m], within 0 and MOST_M.
         number: that records tell it by.
     """
 
@@ -61,8 +62,11 @@ class Thing:
     number: int = 1
 
     def __post_init__(self) -> None:
-        if self.kind not in (DISK, BAR) or not 0.0 < self.size_m < 0.5:
-            raise ValueError(f"survey object: kind {self.kind}, size {self.size_m:g} m; want 1 or 2, and 0 to 0.5 m")
+        if self.kind not in (DISK, BAR):
+            raise ValueError(f"survey object: kind {self.kind}; want {DISK}, a disk, or {BAR}, a bar")
+        if not 0.0 < self.size_m < MOST_M:
+            what = "radius of the disk" if self.kind == DISK else "width of the bar"
+            raise ValueError(f"survey object: the {what} is {self.size_m:g} m; want less than {MOST_M:g}, above 0")
 
     @property
     def apart_m(self) -> float:

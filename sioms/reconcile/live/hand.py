@@ -57,6 +57,11 @@ class Grasping:
         sizes = [*((DISK, radius) for radius in self.disks), *((BAR, width) for width in self.bars)]
         return [Thing(kind, size, number) for number, (kind, size) in enumerate(sizes, 1)]
 
+    @property
+    def bar(self) -> Thing | None:
+        """The bar that can be clamped, if there is one."""
+        return Thing(BAR, self.clamped, len(self.disks) + len(self.bars) + 1) if self.clamped else None
+
 
 def live(model: Path, asked: Grasping, folder: Path, say: Say) -> tuple[SensorVerdict, float]:
     """Reconcile a hand behind a daemon.
@@ -74,14 +79,14 @@ def live(model: Path, asked: Grasping, folder: Path, say: Say) -> tuple[SensorVe
         OSError: the daemon or a node cannot be reached.
     """
     read_model(model)
-    first = asked.things[: None if asked.full else 1]
+    first = _chosen(asked)
     _check(asked, first)
     _agree(asked, first)
     with sioms.Workcell(asked.socket, "reconcile") as cell, kept(folder) as fresh:
         bench = Bench(cell, asked, fresh, say)
         for thing in first:
             bench.grasp(thing)
-        if asked.full and asked.clamped:
+        if asked.full:
             bench.slide()
         return decide(
             lambda: reconcile_hand(fresh, model, asked.seed, say),
@@ -90,6 +95,15 @@ def live(model: Path, asked: Grasping, folder: Path, say: Say) -> tuple[SensorVe
             ROUNDS,
             say,
         )
+
+
+def _chosen(asked: Grasping) -> list[Thing]:
+    """Return the objects of the first round; none of those at hand may be one that no hand takes."""
+    try:
+        things, _ = asked.things, asked.bar
+    except ValueError as error:
+        raise BadInputError(f"grasp with {asked.nodes.hand}: {error}") from None
+    return things if asked.full else things[:1]
 
 
 def _check(asked: Grasping, first: Sequence[Thing]) -> None:
@@ -152,8 +166,10 @@ class Bench:
         self._carry(thing, settings(self._asked.grasps, loads, seed=seed), False)
 
     def slide(self) -> None:
-        """Drag the fingers along the clamped bar."""
-        bar = Thing(BAR, self._asked.clamped, len(self._asked.things) + 1)
+        """Drag the fingers along the clamped bar, if there is one."""
+        bar = self._asked.bar
+        if bar is None:
+            return
         have_done(f"clamp {described(bar)}, to the platen", "leave out --clamped to work unattended")
         self._lies = None
         self._carry(bar, settings(_drags(self._asked), SLIPS_N), True)

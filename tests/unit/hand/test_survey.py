@@ -51,7 +51,7 @@ def test_a_recording_is_read_by_what_analyses_it(tmp_path: Path) -> None:
 
 def test_known_objects_are_disks_and_bars() -> None:
     assert Thing(DISK, 0.02).apart_m == 0.04
-    with pytest.raises(ValueError, match="want 1 or 2"):
+    with pytest.raises(ValueError, match="want 1, a disk, or 2, a bar"):
         Thing(0, 0.02)
 
 

@@ -123,6 +123,8 @@ def test_one_object_first_and_the_others_only_when_they_decide(
     (Grasping(Nodes(wrists=()), (0.02,), clamped=0.03, yes=True), "no --clamped bar"),
     (Grasping(Nodes(wrists=("wrist1",)), (0.02,), yes=True), "1 wrists; needs two"),
     (Grasping(Nodes(), (0.02,)), "nobody to ask"),
+    (Grasping(Nodes(), (0.02, 5.0), yes=True), r"hand: .* radius of the disk is 5 m; want less than 0.5"),
+    (Grasping(Nodes(), (0.02,), clamped=30.0, yes=True), "the width of the bar is 30 m"),
 ])  # fmt: skip
 def test_what_cannot_be_is_refused_before_anything_moves(
     cell: Cell, tmp_path: Path, asked: Grasping, said: str
