@@ -113,11 +113,13 @@ class Survey(Skills):
 
     Attributes:
         rows: recorded so far, by `COLUMNS`.
+        progress: told of every grasp that has been made, while the hand is open.
     """
 
     def __init__(self, hand: Hand, first: Reading, thing: Thing, manner: Manner | None = None) -> None:
         super().__init__(hand, first, manner)
         self.thing, self.rows = thing, list[list[float]]()
+        self.progress: Callable[[str], None] = lambda text: None
         self._number = 0
 
     def carry_out(self, plan: Sequence[Setting], told: Told, first: int = 0) -> Generator[Setpoint, Reading, int]:
@@ -154,6 +156,7 @@ class Survey(Skills):
                 middle = yield from one(setting, middle, told, first + self._number)
                 failed = 0
                 self._number += 1
+                self.progress(f"grasp {self._number} of {len(plan)}, {len(self.rows)} rows")
             except Failed as fault:
                 self.say(str(fault), fault.fault)
                 del self.rows[before:]  # half a grasp

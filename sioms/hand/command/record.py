@@ -104,6 +104,11 @@ def run(args: argparse.Namespace) -> int:
     return 0 if grasps == len(plan) else 1
 
 
+def tell(text: str) -> None:
+    """Say how far it is."""
+    print(text, file=sys.stderr, flush=True)
+
+
 def earlier(path: Path, append: bool) -> list[list[float]]:
     """Return the rows of a recording that is continued.
 
@@ -138,6 +143,7 @@ def _in_plane(
         body, pose = Body(outline, CLAMPED_KG, CLAMPED), (1e-3, -2e-3, 0.0)
     hand = PlaneHand(body, pose, Rig(turned_rad=turned), mounts, args.seed)
     survey = Survey(hand.hand, hand.reading, thing)
+    survey.progress = tell
     surveys.append(survey)
     hand.run((survey.slide if args.slips else survey.carry_out)(plan, hand.beside, first), MOST_S)
 
@@ -180,5 +186,6 @@ def _in_cell(
 
     nodes = Nodes(args.node, tuple(args.fingers), tuple(args.modules), tuple(args.wrists))
     with Workcell(name="hand") as cell, surveying(cell, nodes, thing, args.slips) as (survey, carry):
+        survey.progress = tell
         surveys.append(survey)
         carry(plan, first)

@@ -198,6 +198,7 @@ class Bench:
         self._say(f"{len(plan)} grasps of {described(thing)}" + (", fingers dragged along it" if slips else ""))
         try:
             with surveying(self._cell, self._asked.nodes, thing, slips) as (survey, carry):
+                survey.progress = self._say
                 try:
                     carry(plan, next_grasp(self._rows))
                 finally:

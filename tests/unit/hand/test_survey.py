@@ -59,7 +59,10 @@ def test_a_survey_records_grasps_that_close_on_the_object(tmp_path: Path) -> Non
     """A hand that is as stated closes to a tenth of a millimetre, and its drives bend as Table 4.1 says."""
     hand = PlaneHand(Body(disk(0.02)), (1e-3, -2e-3, 0.0), Rig(every=4, compiled=False), Mount(), seed=1)
     survey = Survey(hand.hand, hand.reading, Thing(DISK, 0.02), Manner(frames=10))
+    told: list[str] = []
+    survey.progress = told.append
     assert hand.run(survey.carry_out(settings(1, (0.5, 1.5)), hand.beside)) == 1 and not hand.is_held()
+    assert told == ["grasp 1 of 1, 2 rows"]
     (tmp_path / "a.csv").write_text(text_of(survey.rows))
     read = reconciled.read_grasps(tmp_path / "a.csv")
     assert len(read) == 2 and read.load[:, 0] == pytest.approx([0.5, 1.5], rel=0.15)
