@@ -95,6 +95,9 @@ def _requests() -> list[str]:
     lines = [
         "## Requests of Ioctl",
         "",
+        "(*) On axes the argument may be the index of an axis in the node, or a list of indices; without one it",
+        "concerns all axes. A STOP with an index that is none stops all of them, and is then refused.",
+        "",
         "| number | request | right | needs the output node | shown in readings | |",
         "| ---: | --- | --- | --- | --- | --- |",
     ]

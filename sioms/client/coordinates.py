@@ -1,12 +1,15 @@
 """One axis in the user's own coordinates: another zero, another direction.
 
 The coordinates of a node are shared by all its clients: raw is what the device counts, CALIBRATE_DEVICE and
-homing set the offset from it. User coordinates are this client's own view of them and change nothing in the driver.
+homing set the offset from it. User coordinates are this client's own view of them and change nothing in the driver,
+except by ``calibrate`` and ``zero``.
 
 Concurrency: as the node that it looks at.
 """
 
 from __future__ import annotations
+
+from sioms.protocol.flags import AxisStatus
 
 from .arguments import integer, number
 from .faces import Awaiting, Blocking
@@ -71,6 +74,22 @@ class UserAxisVerbs:
         velocity: float = self.node.read().velocity[self.axis]
         return self.direction * velocity
 
+    @property
+    def force(self) -> float:
+        """The measured force or torque."""
+        force: float = self.node.read().force[self.axis]
+        return self.direction * force
+
+    @property
+    def status(self) -> AxisStatus:
+        """The status word; limits and switches are those of the node's own direction."""
+        return AxisStatus(int(self.node.read().status[self.axis]))
+
+    @property
+    def in_motion(self) -> bool:
+        """Whether the axis moves, or is on its way to a target."""
+        return bool(self.node.read().in_motion[self.axis])
+
     def call_here(self, user: float) -> None:
         """Let the present place have this user coordinate; nothing moves, and no other client sees it."""
         self.offset = (
@@ -103,6 +122,45 @@ class UserAxisVerbs:
     async def jog(self, velocity: float, *, acceleration: float | None = None) -> int:
         """Go over to a velocity; see ``AxisNode.jog``."""
         return await AxisVerbs.jog(self.node, self._turn(velocity), self.axis, acceleration=acceleration)
+
+    @verb
+    async def command(self, /, *, timeout: float | None = 0.0, replace: bool = False, **words: Any) -> int:
+        """Append a command; the words of ``sioms.command`` in user coordinates."""
+        words = self._turned(words)
+        if "position" in words:
+            turn = self._turn if words.get("relative") else self.to_node
+            words["position"] = turn(words["position"])
+        return await AxisVerbs.command(self.node, self.axis, timeout=timeout, replace=replace, **words)
+
+    @verb
+    async def stop(self) -> None:
+        """Stop this axis at maximum deceleration and empty its buffer; not latched."""
+        await AxisVerbs.stop(self.node, self.axis)
+
+    @verb
+    async def wait_until_idle(self, timeout: float | None = None) -> None:
+        """Wait until this axis stands still and its buffer is empty; see ``AxisNode.wait_until_idle``."""
+        await AxisVerbs.wait_until_idle(self.node, timeout, self.axis)
+
+    @verb
+    async def home(self) -> None:
+        """Start homing this axis; ``wait_until_idle`` waits for its end."""
+        await AxisVerbs.home(self.node, self.axis)
+
+    @verb
+    async def zero(self) -> None:
+        """Make the present position 0 in these coordinates, for all clients; see ``calibrate``."""
+        await UserAxisVerbs.calibrate(self, 0.0)
+
+    @verb
+    async def calibrate(self, user: float) -> None:
+        """Give the present position a new value, for all clients, without motion; other axes keep theirs.
+
+        ``call_here`` changes these coordinates alone.
+        """
+        places: list[float | None] = [None] * len(self.node.info.channels)
+        places[self.axis] = self.to_node(user)
+        await AxisVerbs.calibrate(self.node, *places)
 
     def _turn(self, value: float) -> float:
         return self.direction * number("turn user coordinates", value)

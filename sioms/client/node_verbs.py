@@ -12,7 +12,7 @@ from sioms.protocol.flags import Request
 from sioms.protocol.page import NotReadable
 from sioms.protocol.verbs import Subscribe
 
-from .arguments import integer, numbers, seconds
+from .arguments import integer, number, numbers, seconds
 from .channel import Call
 from .command import command
 from .marks import stream, verb
@@ -283,13 +283,20 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
         return value
 
     @verb
-    async def wait_until_idle(self, timeout: float | None = None) -> None:
-        """Wait until all axes of the node stand still and their buffers are empty.
+    async def wait_until_idle(self, timeout: float | None = None, axis: int | str | None = None) -> None:
+        """Wait until axes stand still and their buffers are empty.
+
+        Args:
+            timeout: how long at most [s]; None: for ever.
+            axis: index or name of one axis; None: all of the node.
 
         Raises:
             OSError: ETIMEDOUT; ECANCELED stopped; EIO fault; EPIPE a marker waited for was freed.
         """
-        await self._ask(Request.WAIT_UNTIL_IDLE, None, timeout)
+        await self._ask(Request.WAIT_UNTIL_IDLE, self._one(axis), timeout)
+
+    def _one(self, axis: int | str | None) -> int | None:
+        return None if axis is None else self.index_of(axis)
 
     @verb
     async def synch(self, start_ns: int | None = None) -> int:
@@ -303,9 +310,13 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
         return here_ns if self.clock is None else self.clock.there(here_ns)
 
     @verb
-    async def stop(self) -> None:
-        """Stop at maximum deceleration and empty the buffers; not latched."""
-        await self._ask(Request.STOP)
+    async def stop(self, axis: int | str | None = None) -> None:
+        """Stop at maximum deceleration and empty the buffers; not latched.
+
+        Args:
+            axis: index or name of one axis; None: all of the node.
+        """
+        await self._ask(Request.STOP, self._one(axis))
 
     @verb
     async def flush(self) -> None:
@@ -313,19 +324,21 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
         await self._ask(Request.FLUSH)
 
     @verb
-    async def home(self) -> None:
-        """Start homing; ``wait_until_idle`` waits for its end."""
-        await self._ask(Request.HOME)
+    async def home(self, axis: int | str | None = None) -> None:
+        """Start homing one axis, given by index or name, or all of the node; ``wait_until_idle`` waits for its end."""
+        await self._ask(Request.HOME, self._one(axis))
 
     @verb
-    async def zero(self) -> None:
-        """Make the present position 0."""
-        await self._ask(Request.ZERO_DEVICE)
+    async def zero(self, axis: int | str | None = None) -> None:
+        """Make the present position 0: of one axis, given by index or name, or of all of the node."""
+        await self._ask(Request.ZERO_DEVICE, self._one(axis))
 
     @verb
-    async def calibrate(self, *positions: float) -> None:
-        """Give the present position of each axis a new value, without motion."""
-        await self._ask(Request.CALIBRATE_DEVICE, numbers(f"calibrate {self.name}", positions))
+    async def calibrate(self, *positions: float | None) -> None:
+        """Give the present position of each axis a new value, without motion; None: it keeps the one that it has."""
+        what = f"calibrate {self.name}"
+        wanted = [None if position is None else number(what, position) for position in positions]
+        await self._ask(Request.CALIBRATE_DEVICE, wanted)
 
     @verb
     async def limits(self) -> dict[str, list[float | None]]:

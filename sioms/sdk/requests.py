@@ -13,6 +13,7 @@ from collections.abc import Generator, Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.motion import CommandError
 from sioms.motion.queue import LIMIT_NAMES
@@ -28,6 +29,8 @@ from .writing import Behind, check_link, end_writes
 
 FEW_TICKS = 1000
 """Ticks that statistics are told of when nobody asks for more."""
+OF_SOME_AXES = {Request.WAIT_UNTIL_IDLE, Request.ZERO_DEVICE, Request.STOP, Request.HOME}
+"""Requests whose argument may be indices of axes in the node, one or a list, instead of none for all of them."""
 
 
 def _refuse(errno_: int, text: str) -> OSError:
@@ -133,14 +136,22 @@ def _axis_request(
     service: Service, handle: Handle, number: int, request: Request, argument: Any,
     timeout_s: float | None, what: str,
 ) -> Any:  # fmt: skip
-    bank, axes, now_ns = handle.block.bank, handle.channels, service.loop.now_ns()  # type: ignore[union-attr]
+    bank, now_ns = handle.block.bank, service.loop.now_ns()  # type: ignore[union-attr]
+    axes = handle.channels
+    if request in OF_SOME_AXES:
+        try:
+            axes = _meant(handle, argument, what)
+        except OSError:
+            if request is Request.STOP:  # rather all than none
+                _axis_request(service, handle, number, request, None, timeout_s, what)
+            raise
     match request:
         case Request.WAIT_UNTIL_IDLE:
             if bank.is_idle(axes) and not handle.writing:
                 if not service.engine.publishes:  # it may have learned so since the last publication
                     service.effects.note()
                 return None
-            block, channels = handle.block, frozenset(handle.axes)
+            block, channels = handle.block, frozenset(axes.tolist())
             service.waits.add(
                 Wait(
                     handle, number, what, service.loop.deadline(timeout_s),
@@ -152,12 +163,12 @@ def _axis_request(
         case Request.SEND_EXTERNAL_SYNCH:
             return _synch(service, handle, number, argument, timeout_s, what)
         case Request.CALIBRATE_DEVICE:
-            bank.calibrate(axes, np.array(_numbers(argument, len(axes), what, "position")))
+            _calibrate(handle, argument, what)
         case Request.ZERO_DEVICE:
             bank.zero(axes)
         case Request.STOP:
             reason = Reason(Stop.CONTROLLED, f"stopped by {handle.who}", errno.ECANCELED)
-            service.stops.safe_stop(reason, [(handle.block, handle.axes, -1)])
+            service.stops.safe_stop(reason, [(handle.block, axes.tolist(), -1)])
         case Request.FLUSH:
             end_writes(service, handle.writing, "flushed")
             bank.flush(axes)
@@ -174,6 +185,29 @@ def _axis_request(
             raise _refuse(errno.ENOTTY, f"{what}: not a request of an axis")
     service.engine.commands_written(handle.block)
     return None
+
+
+def _meant(handle: Handle, argument: Any, what: str) -> NDArray[np.int64]:
+    """Return the axes that are asked for by their indices in the node: one, several, or all for None."""
+    if argument is None:
+        return handle.channels
+    asked = argument if isinstance(argument, list) else [argument]
+    want = f"want indices from 0 to {len(handle.channels) - 1}, or none for all axes"
+    for index in asked or [None]:
+        if type(index) is not int or not 0 <= index < len(handle.channels):
+            raise _refuse(errno.EINVAL, f"{what}: axis {shown(index)}; {want}")
+    return handle.channels[sorted(set(asked))]
+
+
+def _calibrate(handle: Handle, argument: Any, what: str) -> None:
+    """Give axes the positions that they are to have; those with None keep theirs."""
+    asked = argument if isinstance(argument, list) else [argument]
+    rows = [row for row, position in enumerate(asked) if position is not None]
+    positions = _numbers([asked[row] for row in rows], len(rows), what, "position")
+    if len(asked) != len(handle.channels):
+        raise _refuse(errno.EINVAL, f"{what}: {len(asked)} values of position; want {len(handle.channels)}")
+    if rows:
+        handle.block.bank.calibrate(handle.channels[rows], np.array(positions))  # type: ignore[union-attr]
 
 
 def _synch(service: Service, handle: Handle, number: int, argument: Any, timeout_s: float | None, what: str) -> Any:

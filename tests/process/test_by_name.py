@@ -12,6 +12,7 @@ from daemon_rig import Daemon, raises
 
 import sioms
 import sioms.aio
+from sioms.protocol.flags import AxisStatus, Request
 
 
 def test_axes_are_chosen_by_name(cell: sioms.Workcell) -> None:
@@ -25,6 +26,56 @@ def test_axes_are_chosen_by_name(cell: sioms.Workcell) -> None:
         arm[second].move(0.0)
         arm.wait_until_idle(timeout=5.0)
         assert f"mod0['{second}']" in repr(arm[second]) and " m>" in repr(arm[second])
+
+
+def test_one_axis_is_stopped_while_the_others_go_on(cell: sioms.Workcell) -> None:
+    with cell.open("mod0", "rw") as arm:
+        first, second = arm[0], arm[1]
+        arm.move(0.4, axis=1, time=3.0)
+        first.jog(0.05)
+        first.stop()
+        first.wait_until_idle(timeout=2.0)
+        assert not first.in_motion and AxisStatus.MOVING not in first.status
+        assert second.in_motion and "status=MOVING" in repr(arm.read()[1]), "the other went on"
+        with raises(errno.ETIMEDOUT, "WAIT_UNTIL_IDLE"):
+            arm.wait_until_idle(timeout=0.05)
+        first.move(0.0)
+        first.wait_until_idle(timeout=5.0)
+        assert first.position == pytest.approx(0.0, abs=1e-3) and second.in_motion
+        arm.stop(arm.info.channels[1].name)
+        second.wait_until_idle(timeout=2.0)
+        assert second.position < 0.39
+
+
+def test_a_stop_of_an_axis_that_is_none_stops_them_all(cell: sioms.Workcell) -> None:
+    with cell.open("mod0", "rw") as arm:
+        for wrong in (7, -1, [0, 9], "x", []):
+            arm[0].jog(0.05)
+            arm[1].jog(0.05)
+            with raises(errno.EINVAL, "STOP on mod0", "want indices from 0 to"):
+                arm.ioctl(Request.STOP, wrong)
+            arm.wait_until_idle(timeout=2.0)
+        for request in (Request.HOME, Request.ZERO_DEVICE, Request.WAIT_UNTIL_IDLE):
+            with raises(errno.EINVAL, request.name, "axis 7"):
+                arm.ioctl(request, 7)
+
+
+def test_one_axis_is_calibrated_and_the_others_keep_their_places(cell: sioms.Workcell) -> None:
+    with cell.open("mod0", "rw") as arm:
+        arm.wait_until_idle(timeout=2.0)
+        before = arm.read().position
+        arm[0].calibrate(0.1)
+        after = arm.read().position
+        assert after[0] == pytest.approx(0.1) and after[1:] == before[1:]
+        turned = arm.user(0, offset=0.5, direction=-1)
+        turned.zero()
+        assert turned.position == pytest.approx(0.0, abs=1e-9) and arm.read().position[0] == pytest.approx(0.5)
+        arm[0].zero()
+        with raises(errno.EINVAL, "CALIBRATE_DEVICE", "1 values"):
+            arm.calibrate(0.1)
+        with raises(errno.ERANGE, "CALIBRATE_DEVICE"):
+            arm[0].calibrate(1e6)
+        assert arm.read().position[1:] == before[1:] and arm.read().position[0] == 0.0
 
 
 def test_an_unknown_axis_is_refused_with_those_that_there_are(cell: sioms.Workcell) -> None:
