@@ -141,7 +141,7 @@ class Ticker(TickDriver):
 
         return SimpleNamespace(
             record=None, tick=tick, slack=lambda *_: 0, rest=lambda *_: int(self.rests),
-            stop=lambda *_: int(not self.brakes), is_ready=lambda _: True, resume=lambda: None,
+            stop=lambda *_: int(not self.brakes), is_ready=lambda *_: True, resume=lambda: None,
         )  # fmt: skip
 
 

@@ -1,5 +1,6 @@
 """A simulated driver with its pages, ticked as the loop does, by steps where it may."""
 
+import os
 from types import MappingProxyType
 
 import msgspec
@@ -45,14 +46,16 @@ class Cell:
         self.driver = SimAxes("mod0", settings, Kit(self))
         self.driver.make_up_ns = make_up_ns
         self.pages = Pages("mod0", self.driver.blocks, 10**9, 1, lambda blocks, state, reason: None)
+        for fd in self.pages.fds:
+            os.close(fd)
         self.instants = np.zeros(2, dtype=np.int64)
         steps = self.driver.quiet_steps(self.pages, self.instants)
         self.steps = steps if by_steps else None
         self.number, self.quiet = 0, 0
 
-    def tick(self, now_ns):
+    def tick(self, now_ns, awaited=False):
         self.number += 1
-        if not (self.steps and self.by_step(now_ns)):
+        if not (self.steps and self.by_step(now_ns, awaited=awaited)):
             self.driver.tick(now_ns)
             for block in self.driver.blocks:
                 self.pages.publish(block, block.stamp_ns or now_ns, self.number, now_ns)
@@ -72,9 +75,9 @@ class Cell:
         self.driver.slack(now_ns, now_ns + 10 * PERIOD_NS)
         return self.driver.is_at_rest()
 
-    def by_step(self, now_ns, watched=True):
+    def by_step(self, now_ns, watched=True, awaited=False):
         steps = self.steps
-        if not steps.is_ready(watched) or not self.pages.lend():
+        if not steps.is_ready(watched, awaited) or not self.pages.lend():
             return False
         done = steps.tick(steps.record, now_ns, now_ns, self.number) == 0
         self.quiet += done

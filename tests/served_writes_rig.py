@@ -137,6 +137,7 @@ class Served:
             request=StopFile(there=1, file=request, word=0, changed=changed_ns(request)), gives_way=0,
             packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, size=row(), writer=row(), came=row(),
             effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0, grace_ns=0,
+            patience_ns=0,
             reply=np.zeros(REPLY, dtype=np.uint8),
         )  # fmt: skip
 

@@ -4,8 +4,16 @@ from __future__ import annotations
 
 from typing import Final
 
-from sioms.motion.axis_step import ENDS, LATE, NOT_FINITE, ODD, WIDE, Loop, quiet_tick
-from sioms.motion.stop_step import Stopping, go_on, rest_stopped, stop_axes
+from sioms.motion.axis_step import (
+    ENDS,
+    SETTLED,
+    Loop,
+    command_quietly,
+    show,
+    take_quietly,
+)
+from sioms.motion.plan_step import Plans, all_idle, come_to_rest, go_on, may_go_on
+from sioms.motion.stop_step import rest_stopped, stop_axes
 from sioms.native.language import Floats, Integers, Record, step
 from sioms.native.system import clock_ns
 from sioms.plant.binary_step import Beams, look
@@ -16,8 +24,6 @@ from sioms.sdk.quiet_step import ALIVE, INPUTS, OUTPUTS, Page, publish, shown_as
 NOT_READY: Final = 1 << 20
 EDGE: Final = 1 << 21
 """Nothing was done; all was done, but a beam may have changed."""
-UNDONE: Final = LATE | ENDS | NOT_FINITE | WIDE | ODD
-"""What a bank finds before it has done anything of a tick."""
 
 
 class SimulatedAxes(Record):
@@ -45,7 +51,7 @@ class SimulatedAxes(Record):
     seen: Floats
     near: Floats
     loop: Loop
-    stopping: Stopping
+    plans: Plans
     motors: Motors
     steppers: Steppers
     beams: Beams
@@ -130,7 +136,8 @@ def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int, beside_ns: int) -> int:
     while s.ahead < ticks:
         if move_axes(s):
             return NOT_READY
-    if rest_stopped(s.stopping, now_ns) if s.stopping.braked_ns else go_on(s.stopping, now_ns):
+    brakes = s.plans.braked_ns != 0
+    if rest_stopped(s.plans, now_ns) if brakes else not may_go_on(s.plans, now_ns):
         return ENDS
     loop = s.loop
     m = s.motors
@@ -143,9 +150,16 @@ def turn_axes(s: SimulatedAxes, now_ns: int, ticks: int, beside_ns: int) -> int:
         loop.measured[i] = p.reading[j] + p.velocity[j] * (beside_ns * 1e-9)
         loop.switches[i] = (1 if p.at_minus[j] else 0) + (2 if p.at_plus[j] else 0) + (4 if p.at_home[j] else 0)
     s.instants[INPUTS] = clock_ns()
-    found = quiet_tick(loop, now_ns)
-    if found & UNDONE:
+    found = take_quietly(loop, now_ns)
+    if found:
         return found
+    if not brakes:
+        go_on(s.plans, now_ns)
+    found = command_quietly(loop, now_ns)
+    if found == SETTLED and not brakes and not come_to_rest(s.plans, now_ns):
+        found = show(loop)
+    if s.plans.untold:
+        s.idle = all_idle(s.plans)
     s.ahead = max(0, s.ahead - ticks)
     s.still = 0
     s.last_ns = now_ns - beside_ns
@@ -176,9 +190,9 @@ def brake_axes(s: SimulatedAxes, now_ns: int, latches: int, since_ns: int) -> in
     if s.found or now_ns - s.last_ns > s.late_ns:
         return 1
     if s.still:
-        return stop_axes(s.stopping, now_ns, latches)
+        return stop_axes(s.plans, now_ns, latches)
     latest_ns = min(now_ns, s.loop.last_ns + s.period_ns)
-    return stop_axes(s.stopping, min(max(since_ns, s.loop.last_ns), latest_ns), latches)
+    return stop_axes(s.plans, min(max(since_ns, s.loop.last_ns), latest_ns), latches)
 
 
 @step

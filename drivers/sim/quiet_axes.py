@@ -37,7 +37,7 @@ class QuietAxes:
         self.record = SimulatedAxes(
             period_ns=world.tick_ns, late_ns=world.late_ns, make_up_ns=make_up_ns, stride=world.stride,
             ahead=0, last_ns=0, found=0, plain=0, idle=0, may_rest=0, still=0, seen=world.seen,
-            near=world.near, loop=world.bank.loop, stopping=world.bank.stopping,
+            near=world.near, loop=world.bank.loop, plans=world.bank.plans,
             motors=motors.record if motors else Motors.empty(),
             steppers=steppers.record if steppers else Steppers.empty(), beams=self._beams,
             motor_rows=world.servo_rows, stepper_rows=world.stepper_rows,
@@ -47,9 +47,10 @@ class QuietAxes:
             port=pages.record(world.port) if world.port else Page.empty(),
         )  # fmt: skip
 
-    def is_ready(self, watched: bool) -> bool:
+    def is_ready(self, watched: bool, awaited: bool = False) -> bool:
         """Tell whether nothing but motion is to be expected."""
         world, record = self._world, self.record
+        world.bank.plans.awaited = awaited
         if world.ahead > 1 or world.found or not world.plant.is_plain:
             return False
         if not world.bank.is_quiet() and not (world.plan_early() and world.bank.is_quiet()):

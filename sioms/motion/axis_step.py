@@ -2,7 +2,7 @@
 
 ``AxisBank`` owns the arrays and decides; here nothing is decided. The parts in their order are ``take`` and ``watch``,
 ``filter_velocity``, ``set_points``, ``control``, ``follow`` and ``show``. Each but the last tells by its flags what the
-bank has to look at before the next; ``quiet_tick`` does all of them as long as there is nothing.
+bank has to look at before the next; ``take_quietly`` and ``command_quietly`` do them as long as there is nothing.
 
 Servo (dissertation, section F.2.4): ``u[n] = k (e[n] + kz e[n-1]) - kp tau[n-1] + kb v[n] + tau_o``,
 ``tau[n] = clip(u[n], -tau_m, tau_m)``; e desired minus actual position, v the filtered actual
@@ -465,16 +465,12 @@ def show(a: Loop) -> int:
 
 
 @step
-def quiet_tick(a: Loop, now_ns: int) -> int:
-    """Do a whole tick in which nothing begins, ends or is out of order. Returns 0, or what the bank has to see to.
-
-    LATE, ENDS, NOT_FINITE, WIDE and ODD: the bank does the tick. AT_LIMIT, FOLLOWS_BADLY, ON_SWITCH and SETTLED: so
-    much of it has been done as comes before that, and the bank goes on from there.
+def take_quietly(a: Loop, now_ns: int) -> int:
+    """Begin a tick in which nothing is out of order: take the readings. Returns 0; or LATE, NOT_FINITE, WIDE or ODD,
+    and the bank does the tick.
     """
     if now_ns - a.last_ns > a.late_ns:
         return LATE
-    if now_ns >= a.next_ns:
-        return ENDS
     a.seen_ns = now_ns
     found = take(a, now_ns)
     if not found and now_ns >= a.due_ns:
@@ -485,6 +481,14 @@ def quiet_tick(a: Loop, now_ns: int) -> int:
     begin_tick(a, now_ns)
     for i in range(a.n):
         a.begun[i] = 0
+    return 0
+
+
+@step
+def command_quietly(a: Loop, now_ns: int) -> int:
+    """Command the axes in the rest of such a tick. Returns 0; or AT_LIMIT, FOLLOWS_BADLY, ON_SWITCH and SETTLED: so
+    much has been done as comes before that, and the bank goes on from there.
+    """
     found = set_points(a, now_ns)
     if not found:
         control(a)

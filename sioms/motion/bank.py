@@ -111,8 +111,9 @@ class Bank(ABC):
     def offer(self, records: Sequence[tuple[Any, ...]], axes: AxesLike, now_ns: int, *, replace: bool = False) -> bool:
         """Take a short write at once; False, and nothing taken, when append() has to judge it.
 
-        The next tick or verb carries it out at its own instant: the writer has its acknowledgement sooner, and
-        set-points that are replaced before any tick has seen them are never planned.
+        The next tick or verb carries it out at its own instant, or that of the last tick if this has come since: the
+        writer has its acknowledgement sooner, and set-points that are replaced before any tick has seen them are never
+        planned.
 
         Args:
             records: up to MOST, each as a tuple of the columns of an axis command.
@@ -128,7 +129,7 @@ class Bank(ABC):
         touched = frozenset([command.axis for command in commands])
         if replace and written:
             written = self._written = [older for older in written if not older.axes <= touched]
-        written.append(Written(commands, touched, replace, now_ns))
+        written.append(Written(commands, touched, replace, max(now_ns, self._last_ns)))
         if len(written) > MOST:
             self._settle()
         return True

@@ -87,7 +87,7 @@ class AxisBank(Bank):
             settings, self._queue, store, self._law, self._arrivals, self._position, self._velocity, self._in_motion,
             tick_s,
         )  # fmt: skip
-        self.stopping = self._sequencer.stopping(self._braked)
+        self.plans = self._sequencer.plans(self._braked)
         self._braked_ns = 0
         """When the stop of these axes began [ns]; 0: there are none."""
         self._guard = LimitGuard(self._queue, self._sequencer)
@@ -307,7 +307,7 @@ class AxisBank(Bank):
         return self._actuator
 
     def is_quiet(self) -> bool:
-        """Tell whether the next ticks may be ``axis_step.quiet_tick``, as long as that finds nothing.
+        """Tell whether the next ticks may be steps, as long as that finds nothing.
 
         So it is where no command waits for a tick, no marker is waited for, no axis is homing or has left force mode.
         """
@@ -317,7 +317,7 @@ class AxisBank(Bank):
             or self._law.force_ends.any or sequencer.has_work or self.keeper is not None
         ):  # fmt: skip
             return False
-        self.stopping.braked_ns = 0
+        self.plans.braked_ns = 0
         loop.any_guard, loop.next_ns, loop.last_ns = sequencer.any_guard, sequencer.store.next_ns, self._last_ns
         return True
 
@@ -329,10 +329,13 @@ class AxisBank(Bank):
         if self._last_ns != self.loop.last_ns:
             self._last_ns = self.loop.last_ns
             self._sequencer.begin_tick(self.loop.dt)
+        if self.plans.untold:
+            self.plans.untold = 0
+            self._sequencer.tell_ends()
         if self.loop.next_ns != self._sequencer.store.next_ns:  # segments have ended
             self._sequencer.store.look_ahead()
-        if self.stopping.braked_ns and self._braked.any():
-            self._braked_ns = self.stopping.braked_ns
+        if self.plans.braked_ns and self._braked.any():
+            self._braked_ns = self.plans.braked_ns
             self._sequencer.after_stop()
 
     def finish_tick(self, found: int) -> NDArray[np.float64]:

@@ -23,17 +23,15 @@ from .arrival import Approach, Arrivals, plan_point
 from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, SETTLING, STOP
 from .commands import Command, is_point_move
 from .law import ControlLaw
+from .plan_step import STILL, Plans
 from .profile import Bounds, InfeasibleError, Plan, Planner, State, plan_force
 from .queue import CommandQueue
 from .settings import AxisSettings
-from .stop_step import Stopping
 from .store import UNCUT_NS, PlanStore
 from .types import EventKind
 
 Axes = NDArray[np.int64]
 Floats = NDArray[np.float64]
-REST = 1e-9
-"""Speed below which a set-point is at rest [unit/s]."""
 PIECES = 2
 """Pieces of a period that are not short: time itself bounds how many of them end in a tick, and they keep their
 instants.
@@ -107,6 +105,8 @@ class Sequencer:
         self._start_velocity = [s.start_velocity for s in settings]
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
+        self._ended_ns, self._idle_ns = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
+        """When steps have found ends that are yet to be told [ns]; 0: they have not."""
         self._tick_s = tick_s
         self._begun = law.begun
         """Commands begun after short ones since the last tick began."""
@@ -196,16 +196,27 @@ class Sequencer:
                 self._todo.pop(axis, None)
                 self._held.pop(axis, None)
 
-    def stopping(self, fresh: NDArray[np.bool_]) -> Stopping:
-        """Return what the steps of a stop work on; ``fresh`` is theirs to fill."""
+    def plans(self, fresh: NDArray[np.bool_]) -> Plans:
+        """Return what steps go on with; ``fresh`` is theirs to fill."""
         store = self.store
-        return Stopping(
+        return Plans(
             loop=self._law.loop, row=store.row, start_ns=store.start_ns, start_fraction=store.start_fraction,
             end_ns=store.end_ns, cut_ns=store.cut_ns, duration=store.duration, final=store.final,
             row_kind=self._row_kind, row_signals=self._row_signals, row_checked=self._row_checked,
             row_taken=self._row_taken, stopped=self.stopped, fresh=fresh,
-            braked_ns=0, **store.segments,
+            braked_ns=0, outcome=self.outcome, in_motion=self._in_motion, awaited=0, ended_ns=self._ended_ns,
+            idle_ns=self._idle_ns, untold=0, **store.segments,
         )  # fmt: skip
+
+    def tell_ends(self) -> None:
+        """Tell of the ends that steps have found, in their order; those of a tick together."""
+        noted = ((EventKind.ENDED, self._ended_ns), (EventKind.IDLE, self._idle_ns))
+        found = [(at_ns, i) for i, (_, when_ns) in enumerate(noted) for at_ns in set(when_ns.tolist()) if at_ns]
+        for at_ns, i in sorted(found):
+            kind, when_ns = noted[i]
+            self._queue.emit(kind, np.flatnonzero(when_ns == at_ns), at_ns)
+        self._ended_ns[:] = self._idle_ns[:] = 0
+        self._settle_masks()
 
     def after_stop(self) -> None:
         """Go on behind a stop that steps have begun: plans that are over are due."""
@@ -351,7 +362,7 @@ class Sequencer:
 
     def _hold_back(self, axes: Axes, state: Floats, short: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
         """Count what follows short commands; take out of ``free`` the axes that have had their share of this tick."""
-        begun, rests = self._begun[axes], np.abs(state[:, 1]) <= REST
+        begun, rests = self._begun[axes], np.abs(state[:, 1]) <= STILL
         over = free & short & (begun >= np.where(rests, 1, self._pieces))
         for i in np.flatnonzero(over).tolist():
             if rests[i] and self._spare:
@@ -451,7 +462,7 @@ class Sequencer:
     def _rest(self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
         """Nothing follows: hold the axes at rest, brake the others."""
         store = self.store
-        still = np.abs(state[:, 1]) <= REST
+        still = np.abs(state[:, 1]) <= STILL
         chosen = axes[still]
         if chosen.size:
             came = chosen[self.kind[chosen] != HOLD]

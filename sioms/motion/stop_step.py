@@ -1,5 +1,4 @@
-"""What becomes of plans where nothing is decided: the segments that follow, and the beginning of an emergency stop of
-axes whose loop the host closes, without what follows from it.
+"""The beginning of an emergency stop of axes whose loop the host closes, without what follows from it.
 
 ``Sequencer.halt`` does the same for axes in any state; here are those states in which no decision is left. Axes are
 latched with their brakes, so no reading shows one without the other. What is dropped and told is the bank's, which does
@@ -9,45 +8,15 @@ that later as if it had done so at the instant of the stop.
 from __future__ import annotations
 
 import math
-from typing import Final
 
-from sioms.native.language import Flags, Floats, Integers, Record, step
+from sioms.native.language import step
 from sioms.native.numbers import whole
 from sioms.protocol.flags import AxisStatus
 
 from .axis_step import FORCE, HOLD, REST, STOP, Loop
+from .plan_step import PIECE, Plans
 from .profile import MAX_SEGMENTS
 from .store import NEVER_NS, UNCUT_NS
-
-PIECE: Final = 6
-"""Coefficients of a segment."""
-
-
-class Stopping(Record):
-    """The plans of n axes; arrays (n,) or, of rows, (2 n,), see store.py and sequencer.py.
-
-    ``braked_ns``: when they began to stop [ns], 0: they have not; ``fresh`` axes had not been stopped before.
-    """
-
-    loop: Loop
-    row: Integers
-    start_ns: Integers
-    start_fraction: Floats
-    segment: Integers
-    end_ns: Integers
-    cut_ns: Integers
-    count: Integers
-    duration: Floats
-    final: Floats
-    ends: Floats
-    coefficients: Floats
-    row_kind: Integers
-    row_signals: Flags
-    row_checked: Flags
-    row_taken: Flags
-    stopped: Flags
-    fresh: Flags
-    braked_ns: int
 
 
 @step
@@ -68,7 +37,7 @@ def is_behind(a: Loop, i: int) -> int:
 
 
 @step
-def stop_axes(s: Stopping, now_ns: int, latches: int) -> int:
+def stop_axes(s: Plans, now_ns: int, latches: int) -> int:
     """Begin to stop all axes at now, or where the present segment of one has begun since; latched or not. Returns 1,
     and nothing is done, where that is for the bank.
     """
@@ -90,7 +59,7 @@ def stop_axes(s: Stopping, now_ns: int, latches: int) -> int:
 
 
 @step
-def stop_axis(s: Stopping, i: int, now_ns: int, latches: int) -> int:
+def stop_axis(s: Plans, i: int, now_ns: int, latches: int) -> int:
     """Let an axis brake if it moves; latch its stop or not."""
     a = s.loop
     if latches:
@@ -103,7 +72,7 @@ def stop_axis(s: Stopping, i: int, now_ns: int, latches: int) -> int:
 
 
 @step
-def brake(s: Stopping, i: int, now_ns: int) -> int:
+def brake(s: Plans, i: int, now_ns: int) -> int:
     """Let an axis stop at maximum deceleration from its set-point at now."""
     a = s.loop
     n = a.n
@@ -148,55 +117,7 @@ def brake(s: Stopping, i: int, now_ns: int) -> int:
 
 
 @step
-def go_on(s: Stopping, now_ns: int) -> int:
-    """Begin the segments that follow within plans. Returns 1, and nothing is done, where a plan ends by now."""
-    a = s.loop
-    if now_ns < a.next_ns:
-        return 0
-    for i in range(a.n):
-        if s.end_ns[i] <= now_ns and plan_ends(s, i, now_ns):
-            return 1
-    next_ns = NEVER_NS
-    for i in range(a.n):
-        while s.end_ns[i] <= now_ns:
-            a.segment_ns[i] = s.end_ns[i]
-            s.segment[i] += 1
-            load(s, i)
-        next_ns = min(next_ns, s.end_ns[i])
-    a.next_ns = next_ns
-    return 0
-
-
-@step
-def plan_ends(s: Stopping, i: int, now_ns: int) -> int:
-    """Return whether the plan of an axis ends by now, of its own or because it is cut."""
-    row = s.row[i]
-    last = s.count[row] - 1
-    return s.cut_ns[i] <= now_ns or segment_end(s, i, row * MAX_SEGMENTS + last) <= now_ns
-
-
-@step
-def segment_end(s: Stopping, i: int, place: int) -> int:
-    """Return the instant at which a segment ends, as ``PlanStore`` rounds it."""
-    end = s.ends[place] * 1e9 + s.start_fraction[i]
-    if end >= NEVER_NS:
-        return NEVER_NS
-    return min(s.start_ns[i] + int(-whole(-end)), NEVER_NS)
-
-
-@step
-def load(s: Stopping, i: int) -> int:
-    """Take the coefficients and the end of the present segment of an axis."""
-    a = s.loop
-    place = s.row[i] * MAX_SEGMENTS + s.segment[i]
-    for j in range(PIECE):
-        a.present[j * a.n + i] = s.coefficients[place * PIECE + j]
-    s.end_ns[i] = min(segment_end(s, i, place), s.cut_ns[i])
-    return 0
-
-
-@step
-def rest_stopped(s: Stopping, now_ns: int) -> int:
+def rest_stopped(s: Plans, now_ns: int) -> int:
     """Let axes rest whose stops are over, until the bank ends their plans. Returns 1 where one does something else."""
     a = s.loop
     if now_ns < a.next_ns:

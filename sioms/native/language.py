@@ -32,6 +32,7 @@ import numpy as np
 
 MODULES: tuple[str, ...] = (
     "sioms.motion.axis_step",
+    "sioms.motion.plan_step",
     "sioms.motion.stop_step",
     "sioms.motion.plain_step",
     "sioms.plant.friction_step",

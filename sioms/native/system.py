@@ -4,9 +4,11 @@ in C."""
 from __future__ import annotations
 
 import ctypes
+import fcntl
 import os
 import select
 import socket
+import termios
 import time
 
 from .language import Bytes, Context, Integers, record_of
@@ -76,6 +78,12 @@ static inline int64_t sioms_drop_packet(int64_t sock)
 static inline int64_t sioms_send_packet(int64_t sock, uint8_t *packet, int64_t size)
 {
     return send((int)sock, packet, (size_t)size, MSG_DONTWAIT | MSG_NOSIGNAL);
+}
+
+static inline int64_t sioms_unread(int64_t sock)
+{
+    int count = 0;
+    return ioctl((int)sock, TIOCOUTQ, &count) ? 0 : count;
 }
 
 static inline int64_t sioms_first_word_of(int64_t file)
@@ -183,6 +191,14 @@ def send_packet(sock: int, packet: Bytes, size: int) -> int:
             return peer.send(memoryview(packet)[:size], socket.MSG_DONTWAIT)  # type: ignore[arg-type]
         except OSError:
             return -1
+
+
+def unread(sock: int) -> int:
+    """Return how much memory is taken by what has been sent on a socket and its other end has yet to read [bytes]."""
+    try:
+        return int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), "little")
+    except OSError:
+        return 0
 
 
 def first_word_of(file: int) -> int:

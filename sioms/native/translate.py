@@ -25,6 +25,7 @@ HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <stdlib.h>
 #include <string.h>
 #include <sys/epoll.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/timerfd.h>

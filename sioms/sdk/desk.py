@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 
 GRACE_NS = 250_000
 """How long after a packet the loop leaves its client a processor, where a tick later is soon enough."""
+PATIENCE_NS = 3_000_000
+"""How long it does so at most for a client that has yet to read the answer: it is waiting for a processor."""
 SOON_NS = 1_000_000
 
 
@@ -62,6 +64,7 @@ class WriteDesk:
             plain=plain, count=0, fds=row(MOST_WRITERS), first=row(MOST_WRITERS), known=row(MOST_WRITERS),
             axes=row(axes[0].n), heard=row(MOST_WRITERS), request=self.request, gives_way=int(gives_way),
             grace_ns=GRACE_NS if period_ns <= SOON_NS else 0,
+            patience_ns=PATIENCE_NS if period_ns <= SOON_NS else 0,
             packets=self._packets, kept=0, size=row(MOST_KEPT), writer=row(MOST_KEPT),
             came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
             replace=0, at=0, records=0, reply=np.zeros(REPLY, dtype=np.uint8),

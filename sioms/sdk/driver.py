@@ -182,8 +182,13 @@ class QuietSteps(Protocol):
         done because it takes more than that.
         """
 
-    def is_ready(self, watched: bool) -> bool:
-        """Tell whether the next ticks may be steps, and hand the record over; ``watched``: ``rest`` is not asked."""
+    def is_ready(self, watched: bool, awaited: bool = False) -> bool:
+        """Tell whether the next ticks may be steps, and hand the record over.
+
+        Args:
+            watched: ``rest`` is not asked.
+            awaited: somebody waits for the end of a motion; the tick that finds one has to be the driver's then.
+        """
 
     def resume(self) -> None:
         """Take the record over: steps have been done."""

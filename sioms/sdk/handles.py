@@ -220,6 +220,11 @@ class Waits:
         handle.waits[wait.number] = wait
         waiting[wait] = None
 
+    @property
+    def any(self) -> bool:
+        """Whether anything waits."""
+        return bool(self._of)
+
     def until_ns(self) -> int:
         """Return until when nothing can be answered unless there is an event [ns]; 0: now."""
         until_ns = 2**62

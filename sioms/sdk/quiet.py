@@ -87,7 +87,7 @@ class QuietRun:
         """
         record, statistics, idling = self.record, self._statistics, self._idling
         until_ns = self._waits.until_ns()
-        if not until_ns or not self._steps.is_ready(watched) or not self._pages.lend():
+        if not until_ns or not self._steps.is_ready(watched, self._waits.any) or not self._pages.lend():
             return False
         self.desk.lend()
         record.until_ns = min(until_ns, self._clients.until_ns())

@@ -26,7 +26,7 @@ from sioms.native.system import (
     wake,
 )
 
-from .serve_step import Desk, StopFile, is_requested, serve_packet, writer_of
+from .serve_step import Desk, StopFile, is_requested, is_unread, serve_packet, writer_of
 
 STOPPED: Final = 0
 RESETS: Final = 1
@@ -312,7 +312,10 @@ def may_wait(q: Quiet, now_ns: int) -> int:
     """Return whether a tick may come before writes that have been served a moment ago: the loop, which works them in,
     takes long, and their client has yet to get its answer, which may be on this processor.
     """
-    return now_ns - q.desk.came[0] < q.desk.grace_ns and not is_asked(q)
+    if is_asked(q):
+        return 0
+    waited_ns = now_ns - q.desk.came[0]
+    return waited_ns < q.desk.grace_ns or (waited_ns < q.desk.patience_ns and is_unread(q.desk))
 
 
 @step

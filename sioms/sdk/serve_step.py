@@ -20,6 +20,7 @@ from sioms.native.system import (
     give_way,
     look_at_packet,
     send_packet,
+    unread,
 )
 from sioms.protocol.flags import WriteFlag
 from sioms.protocol.messages import HandleVerb
@@ -67,7 +68,8 @@ class Desk(Record):
 
     ``heard``: the instant that the newest Heard of each writer tells, never one that has yet to come; 0: none came.
 
-    A tick that comes less than ``grace_ns`` behind the first packet that is kept may come before it.
+    A tick that comes less than ``grace_ns`` behind the first packet that is kept may come before it; one that comes
+    less than ``patience_ns`` behind it, while a client has yet to read an answer.
 
     ``kept`` packets lie in ``packets``, each in ROOM bytes, with its ``size``, its ``writer``, when it ``came`` and
     took ``effect``, how long serving it ``took`` [ns], and whether its answer could be ``sent``; they hold
@@ -84,6 +86,7 @@ class Desk(Record):
     request: StopFile
     gives_way: int
     grace_ns: int
+    patience_ns: int
     packets: Bytes
     kept: int
     size: Integers
@@ -222,6 +225,15 @@ def writer_of(d: Desk, fd: int) -> int:
         if d.fds[i] == fd:
             return i
     return -1
+
+
+@step
+def is_unread(d: Desk) -> int:
+    """Return whether a client has yet to read the answer to a packet that is kept."""
+    for k in range(d.kept):
+        if unread(d.fds[d.writer[k]]):
+            return 1
+    return 0
 
 
 @step

@@ -5,7 +5,8 @@ import hashlib
 import numpy as np
 
 from sioms.motion import AxisBank, AxisKind, AxisSettings, CommandError, Homing
-from sioms.motion.stop_step import go_on, rest_stopped, stop_axes
+from sioms.motion.plan_step import go_on, may_go_on
+from sioms.motion.stop_step import rest_stopped, stop_axes
 from sioms.native import language
 from sioms.plant.effects import build_effects
 from sioms.plant.motor import MotorBank
@@ -62,7 +63,8 @@ def main():
             reading[:3], reading[3:] = plant.encoder.position, rotor.reading
             switches[:3] = plant.switches
             if tick % 3 and bank.is_quiet():
-                left += go_on(bank.stopping, now)
+                left += not may_go_on(bank.plans, now) or go_on(bank.plans, now)
+                bank.after_quiet()
             out = bank.tick(now, reading, switches if tick % 3 else None)
             plant.advance(out[:3])
             rotor.advance(out[3:] if tick < 4000 else out[3:] * 1.5)
@@ -80,8 +82,8 @@ def main():
         if tick < 3000 and tick % 50 == 24:
             for bank in banks:
                 bank.plan_ahead()
-                if bank.is_quiet() and stop_axes(bank.stopping, now + 300_000, 1) == 0:
-                    rest_stopped(bank.stopping, now + 600_000)
+                if bank.is_quiet() and stop_axes(bank.plans, now + 300_000, 1) == 0:
+                    rest_stopped(bank.plans, now + 600_000)
                     bank.after_quiet()
                     braked += 1
                 bank.emergency_stop(range(5), now + 700_000)

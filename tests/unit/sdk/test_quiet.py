@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from quiet_rig import PERIOD_NS, Cell
 
-from sioms.motion import CommandError
+from sioms.motion import CommandError, EventKind
+from sioms.motion.axis_step import SETTLING
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import numpy_dtype
 from sioms.sdk.driver import TickDriver
@@ -32,6 +33,8 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
             record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
             record["axis"], record["control_mode"] = rng.integers(3), int(mode)
             record[column] = rng.uniform(-most, most)
+        told = [cell.driver.bank.take_events() for cell in (plain, quiet)]
+        assert told[0] == told[1], f"tick {tick}"
         for cell in (plain, quiet):
             bank = cell.driver.bank
             if draw < 0.02:
@@ -45,10 +48,46 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
                 bank.emergency_stop([1], now_ns + 200_000)
             elif draw < 0.028:
                 bank.reset([0, 1, 2])
-            cell.driver.bank.take_events()
     assert quiet.quiet > 2900, "most ticks are steps, those too in which a segment of a profile ends"
     assert 3000 - quiet.quiet > 30, "and some are not"
     assert quiet.driver.blocks[2].edges[0] > 10, "beams were broken, and free again"
+
+
+@pytest.mark.parametrize("awaited", [False, True])
+@pytest.mark.parametrize(
+    "mode, column, value, gain",
+    [(ControlMode.POSITION, "position", 0.02, 1.0), (ControlMode.VELOCITY, "velocity", 0.1, 1.0),
+     (ControlMode.POSITION, "position", 0.02, 0.03)],
+    ids=["position", "velocity", "a soft axis that settles"],
+)  # fmt: skip
+def test_a_motion_ends_by_steps_unless_somebody_waits_for_that(monkeypatch, awaited, mode, column, value, gain):
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))
+    plain, quiet = Cell(False), Cell(True)
+    for cell in (plain, quiet):
+        cell.driver.bank.arrays["k"][:] *= gain
+    now_ns, told, by_steps, settling = 1_000_000_000, ([], []), [], 0
+    for tick in range(1200):
+        now_ns += PERIOD_NS
+        if tick % 300 == 5:
+            records = np.zeros(2, numpy_dtype(NodeClass.AXIS))
+            records["axis"], records["control_mode"] = (0, 1), int(mode | ControlMode.SPECIFIED_TIME)
+            records["time"], records[column] = 0.2, value * (1 if tick % 600 == 5 else -1)
+            for cell in (plain, quiet):
+                cell.driver.bank.append(records, range(3), now_ns - PERIOD_NS)
+                cell.driver.bank.plan_ahead()
+        done = quiet.quiet
+        plain.tick(now_ns)
+        quiet.tick(now_ns, awaited)
+        assert plain.shown() == quiet.shown(), f"tick {tick}"
+        settling += int((quiet.driver.bank.arrays["kind"] == SETTLING).any())
+        for cell, events in zip((plain, quiet), told, strict=True):
+            new = cell.driver.bank.take_events()
+            events += new
+            if cell is quiet and any(event.kind in (EventKind.ENDED, EventKind.IDLE) for event in new):
+                by_steps.append(quiet.quiet > done)
+    assert told[0] == told[1]
+    assert len(by_steps) >= 4 and (not any(by_steps) if awaited else any(by_steps))
+    assert (settling > 0) == (gain < 1.0)
 
 
 @pytest.mark.parametrize("late", [False, True])

@@ -487,6 +487,24 @@ def test_a_tick_that_follows_at_once_leaves_the_client_its_turn_and_shows_what_w
     assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) and len(device.ticks) == 1
 
 
+@pytest.mark.parametrize("why", ["the answer is read", "it takes too long"])
+def test_ticks_come_before_a_write_until_its_client_has_the_answer(writing, why):
+    device, served = writing
+    served.desk.patience_ns = 10_000_000_000
+    served.ours.send(plain_write(served))
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0
+    for count in (1, 2):
+        os.eventfd_write(device.timer, 1)
+        assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) == 0
+        assert len(device.ticks) == count and device.shown_ns == served.desk.came[0]
+    if why == "the answer is read":
+        served.answer()
+    else:
+        served.desk.patience_ns = 0
+    os.eventfd_write(device.timer, 1)
+    assert heed(device.quiet, quiet_step.wait_for(device.poll.fileno(), device.ready, 0)) and len(device.ticks) == 2
+
+
 @pytest.mark.parametrize("what", [STOPPED, RESETS, ORDERS, "heeded"])
 def test_no_tick_comes_before_a_write_when_something_was_asked_for_behind_it(writing, what):
     device, served = writing
@@ -586,15 +604,15 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
     steps = SimpleNamespace(
         tick=record.quiet.tick, slack=record.quiet.slack, rest=record.quiet.rest, stop=record.quiet.stop,
         record=Page.empty(),
-        is_ready=lambda watched: is_ready, resume=lambda: None,
+        is_ready=lambda watched, awaited: is_ready, resume=lambda: None,
     )  # fmt: skip
     statistics = SimpleNamespace(ring=record.ring.reshape(7, RING), ticks=0, longest_ns=0, skipped=0)
     quiet = QuietRun(
         steps, record.poll.fileno(), record.timer, record.line.fd, record.control, record.latch, PERIOD_NS, 0, LEASE_NS,
         SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
         SimpleNamespace(lend=lambda: lends), SimpleNamespace(seen=(3, 2, 1)),
-        SimpleNamespace(until_ns=lambda: waits_ns), SimpleNamespace(until_ns=lambda: clients_ns), statistics,
-        SimpleNamespace(record=Desk.empty(), request=StopFile.empty(), lend=lambda: None),
+        SimpleNamespace(until_ns=lambda: waits_ns, any=waits_ns < 2**62), SimpleNamespace(until_ns=lambda: clients_ns),
+        statistics, SimpleNamespace(record=Desk.empty(), request=StopFile.empty(), lend=lambda: None),
     )  # fmt: skip
     record.close()
     return quiet

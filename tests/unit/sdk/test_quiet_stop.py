@@ -196,7 +196,7 @@ def test_a_stop_by_steps_begins_neither_before_the_last_tick_nor_before_what_is_
     bank.append(records, AXES, now_ns - PERIOD_NS)
     now_ns = go_on(cell, now_ns, 100)
     assert stop_by_steps(cell, now_ns, since_ns=1)
-    assert bank.stopping.braked_ns == now_ns - PERIOD_NS, "the last tick has shown that they went on"
+    assert bank.plans.braked_ns == now_ns - PERIOD_NS, "the last tick has shown that they went on"
     take_back(cell)
     bank.emergency_stop(AXES, now_ns)
     bank.reset(AXES)
@@ -205,7 +205,7 @@ def test_a_stop_by_steps_begins_neither_before_the_last_tick_nor_before_what_is_
     now_ns = go_on(cell, now_ns, 2)
     begun_ns = now_ns - PERIOD_NS + 1000
     bank._sequencer.store.segment_ns[1] = begun_ns
-    assert stop_by_steps(cell, now_ns, since_ns=1) and bank.stopping.braked_ns == begun_ns
+    assert stop_by_steps(cell, now_ns, since_ns=1) and bank.plans.braked_ns == begun_ns
 
 
 def test_who_is_behind_by_the_step_is_so_by_the_law():
