@@ -5,6 +5,7 @@ from __future__ import annotations
 import collections
 import contextlib
 import ctypes
+import fcntl
 import gc
 import itertools
 import json
@@ -43,6 +44,16 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 PATIENCE_S = 60.0
 """Longest wait for a process that starts or ends [s]: on two cores at a load of 20 a workcell takes 27 s."""
 
+
+def pause_s(passed_s: float) -> float:
+    """Return how long to pause between two looks at what has been waited for so long [s].
+
+    What takes long is looked for less often, to a twentieth of its time: each look at a daemon takes 2 ms of a
+    processor.
+    """
+    return min(max(0.002, 0.05 * passed_s), 0.02)
+
+
 MARKERS = {
     "slow": "takes more than five seconds",
     "root": "needs the rights of root; skipped without",
@@ -56,6 +67,7 @@ def pytest_configure(config: pytest.Config) -> None:
     for name, meaning in MARKERS.items():
         config.addinivalue_line("markers", f"{name}: {meaning}")
     config.option.loadscopereorder = False  # files are handed to workers in the order of their first tests below
+    gc.disable()  # until all is collected: what is imported stays, and is not looked through again and again
 
 
 @pytest.hookimpl(tryfirst=True)
@@ -65,10 +77,26 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: -taken.get(item.nodeid.partition("::")[0], 0.0))
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection(session: pytest.Session) -> Iterator[None]:
+    """Let the workers of a run collect one after the other: in a fresh clone the first compiles all modules and tests,
+    which the others then read.
+    """
+    if not hasattr(session.config, "workerinput") or not hasattr(session.config, "cache"):
+        return (yield)
+    turn = os.open(session.config.cache.mkdir("collecting"), os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    try:
+        fcntl.flock(turn, fcntl.LOCK_EX)
+        return (yield)
+    finally:
+        os.close(turn)
+
+
 def pytest_collection_finish() -> None:
     """Let the garbage collector pass over what lives until the end: modules and tests."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 MOST_LEFT_OPEN = 64
@@ -211,11 +239,11 @@ class Running:
         Raises:
             AssertionError: the process ended before it, or the time ran out; the message holds all that was said.
         """
-        deadline = time.monotonic() + timeout_s
+        began = time.monotonic()
         while not condition():
-            if self.process.poll() is not None or time.monotonic() > deadline:
+            if self.process.poll() is not None or (passed_s := time.monotonic() - began) > timeout_s:
                 raise AssertionError(self._told(f"{what}: not before its end, and not within {timeout_s:g} s"))
-            time.sleep(0.002)
+            time.sleep(pause_s(passed_s))
 
     def signal(self, number: signal.Signals) -> None:
         self.process.send_signal(number)
@@ -294,10 +322,10 @@ def wait_until() -> Callable[..., None]:
     """Poll what gives no line and no event: ``wait_until(predicate, timeout_s=10.0, what="...")``."""
 
     def wait(predicate: Callable[[], object], timeout_s: float = 10.0, what: str = "the condition") -> None:
-        deadline = time.monotonic() + timeout_s
+        began = time.monotonic()
         while not predicate():
-            if time.monotonic() > deadline:
+            if (passed_s := time.monotonic() - began) > timeout_s:
                 raise AssertionError(f"{what} did not come true within {timeout_s:g} s")
-            time.sleep(0.002)
+            time.sleep(pause_s(passed_s))
 
     return wait

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from conftest import PATIENCE_S, Running
+from conftest import PATIENCE_S, Running, pause_s
 
 import sioms
 
@@ -62,11 +62,11 @@ WORKCELL = '[workcell]\nname = "test"\n' + axes("mod0", "xaxis", "yaxis") + axes
 
 def wait_for(predicate: Callable[[], Any], what: str, timeout_s: float = 15.0) -> Any:
     """Poll what gives no event; return the first true value."""
-    deadline = time.monotonic() + timeout_s
+    began = time.monotonic()
     while not (value := predicate()):
-        if time.monotonic() > deadline:
+        if (passed_s := time.monotonic() - began) > timeout_s:
             raise AssertionError(f"{what}: not within {timeout_s:g} s")
-        time.sleep(0.002)
+        time.sleep(pause_s(passed_s))
     return value
 
 
