@@ -101,7 +101,7 @@ def other_master(station: Station, full: bool) -> str:
         check_stops(station, 0.5 * fast, "another master's velocity")
         told = in_fault(node)
         restore(station, node, axis)
-        check_still(station, fast, WATCH_S, "another master's velocity, and RESET")
+        check_still(station, fast, "another master's velocity, and RESET")
     if not told:
         raise Failed("a fault of motion that nobody here commanded", "none")
     station.end_daemon()
@@ -112,7 +112,7 @@ def other_master(station: Station, full: bool) -> str:
     check_stops(station, 0.5 * fast, "the opening of a device that another master left running")
     with station.cell.open(axis.node, "rw", timeout=5.0) as node:
         restore(station, node, axis)
-        check_still(station, fast, WATCH_S, "the opening, and RESET")
+        check_still(station, fast, "the opening, and RESET")
         node.move(0.5 * axis.reach, timeout=2.0)
         node.wait_until_idle(20.0)
         node.move(0.0, timeout=2.0)
@@ -160,7 +160,7 @@ def shoved(station: Station, full: bool) -> str:
             check_stops(station, fast, f"motion {what}")
             check_back(station)
             restore(station, node, axis)
-            check_still(station, fast, WATCH_S / 2, f"motion {what}, and RESET")
+            check_still(station, fast, f"motion {what}, and RESET")
         texts.append(f"motion {what}: told after {1e3 * noticed_s:.0f} ms")
     return ", ".join(texts)
 

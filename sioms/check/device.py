@@ -20,6 +20,8 @@ from .trial import Failed, NotApplicable
 NOTICE_S = 3.0
 """Longest time from what happens in the device to its fault, or the loss of its link [s]."""
 WATCH_S = 0.5
+STAYS_S = 0.25
+"""In which a device that its driver is about to move does so: a dozen polls of the slowest line [s]."""
 STOOD_S = 0.06
 SAFE_S = 4.0
 
@@ -58,7 +60,7 @@ def usual_speed(station: Station, axis: Axis) -> float:
     return fast
 
 
-def check_still(station: Station, fast: float, seconds: float, after: str) -> None:
+def check_still(station: Station, fast: float, after: str, seconds: float = STAYS_S) -> None:
     """Check that the device itself does not move for a time."""
     began = time.monotonic()
     while (now := time.monotonic()) - began < seconds:
@@ -66,7 +68,7 @@ def check_still(station: Station, fast: float, seconds: float, after: str) -> No
         if speed > SLOW * fast:
             seen = f"the device moves at {speed:.6g} (usually {fast:.6g}), {1e3 * (now - began):.0f} ms after it stood"
             raise Failed(f"no motion after {after}", seen)
-        time.sleep(0.001)
+        time.sleep(0.004)
 
 
 def check_stops(station: Station, fast: float, after: str, seconds: float = NOTICE_S) -> None:

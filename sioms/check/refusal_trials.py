@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from .device import (
-    WATCH_S,
     check_safe,
     check_still,
     check_stops,
@@ -51,7 +50,7 @@ def lost_stop(station: Station, full: bool) -> str:
                 check_stops(station, fast, f"{way}, {name}")
                 texts.append(1e3 * (time.monotonic() - began))
                 check_back(station)
-                check_still(station, fast, WATCH_S / 2, f"{way}, {name}")
+                check_still(station, fast, f"{way}, {name}")
                 wait_for(lambda: not seen.read().in_motion[0], 2.0)
             finally:
                 end()

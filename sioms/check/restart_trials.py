@@ -33,7 +33,7 @@ from .trial import Failed, NotApplicable, Trial
 
 BRIEF_S = 0.04
 """A restart that ends before any link counts as lost [s]."""
-OFF_S = 1.5
+OFF_S = 1.0
 SAME_SPEED = 0.25
 """The device's speed before and after may differ by this part."""
 
@@ -61,11 +61,11 @@ def stale(station: Station, full: bool) -> str:
                 time.sleep(0.2)
             do(station, node, fast)
             after = f"{what} ({name} before)"
-            check_still(station, fast, WATCH_S, after)
+            check_still(station, fast, after)
             reset(node)
-            check_still(station, fast, WATCH_S, f"{after}, and RESET")
+            check_still(station, fast, f"{after}, and RESET")
             restore(station, node, axis)
-            check_still(station, fast, WATCH_S, f"{after}, RESET and calibration")
+            check_still(station, fast, f"{after}, RESET and calibration")
     return f"stood still after {len(ways)} ways of closing the loop"
 
 
@@ -90,7 +90,7 @@ def _cable(station: Station, node: Any, fast: float) -> None:
     finally:
         station.tell_wire("plug")
     if alone:
-        check_still(station, fast, WATCH_S, "the cable was put back")
+        check_still(station, fast, "the cable was put back", WATCH_S)
     check_back(station)
     check_stops(station, fast, "the cable was put back")
 
@@ -120,9 +120,9 @@ def restarted(station: Station, full: bool) -> str:
             noticed_s = wait_told(station, node, what)
             check_back(station)
             check_stops(station, fast, what)
-            check_still(station, fast, WATCH_S, what)
+            check_still(station, fast, what)
             restore(station, node, axis)
-            check_still(station, fast, WATCH_S, f"{what}, and RESET")
+            check_still(station, fast, f"{what}, and RESET")
             check_armed(station, before, what)
         again = usual_speed(station, axis)
         if abs(again - fast) > SAME_SPEED * fast:
@@ -155,7 +155,7 @@ def power_cycled(station: Station, full: bool) -> str:
         time.sleep(OFF_S)
         check_back(station)
         time.sleep(WATCH_S)
-        check_still(station, fast, WATCH_S, "a power cycle")
+        check_still(station, fast, "a power cycle")
         shown = node.read().position[0]
         if abs(shown - place) <= max(2 * axis.tolerance, 0.02 * axis.reach):
             restore(station, node, axis, place)

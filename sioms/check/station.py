@@ -39,6 +39,8 @@ MOVED_S = 0.05
 """In which an axis that goes on at its rig's speed leaves its tolerance, twice over at least [s]."""
 LOGGED_S = 1.0
 """Longest time until the daemon has written down what a driver has told it; the node shows it at once [s]."""
+LONGEST_PERIOD_S = 0.02
+"""Longest time between two looks at what is waited for [s]."""
 PRIORITY = 15
 """Of simulators and wires, where real-time priorities are allowed; the drivers' lies above."""
 
@@ -291,15 +293,13 @@ class Station:
             TimeoutError: it is not; the text holds what the daemon says.
         """
         began = time.monotonic()
-        while not self.is_good():
-            if time.monotonic() - began > timeout_s:
-                status = self.status()
-                why = status["reason"] or status["link_reason"] or "no reason given"
-                log = self.daemon.log() if self.daemon is not None else ""
-                text = f"device {self.rig.device}: {status['state']}, link {status['link']}: {why}"
-                said = _crash(log) or f"the daemon said: {log[-1500:]}"
-                raise TimeoutError(f"{text}; not good within {timeout_s:g} s; {said}")
-            time.sleep(0.005)
+        if not wait_for(self.is_good, timeout_s, 0.005):
+            status = self.status()
+            why = status["reason"] or status["link_reason"] or "no reason given"
+            log = self.daemon.log() if self.daemon is not None else ""
+            text = f"device {self.rig.device}: {status['state']}, link {status['link']}: {why}"
+            said = _crash(log) or f"the daemon said: {log[-1500:]}"
+            raise TimeoutError(f"{text}; not good within {timeout_s:g} s; {said}")
         return time.monotonic() - began
 
     def wait_fresh(self, timeout_s: float = UP_S) -> float:
@@ -485,8 +485,11 @@ class Client:
 
 
 def wait_for(condition: Callable[[], Any], timeout_s: float, period_s: float = 0.003) -> Any:
-    """Look until something is true; return it, or what it was last when the time is over."""
-    deadline = time.monotonic() + timeout_s
-    while not (found := condition()) and time.monotonic() < deadline:
-        time.sleep(period_s)
+    """Look until something is true; return it, or what it was last when the time is over.
+
+    What takes long is looked for less often, to a twentieth of its time: who is asked has better things to do.
+    """
+    began = time.monotonic()
+    while not (found := condition()) and (passed_s := time.monotonic() - began) < timeout_s:
+        time.sleep(period_s and min(max(period_s, 0.05 * passed_s), LONGEST_PERIOD_S))
     return found

@@ -131,8 +131,8 @@ class Wire:
         now_ns = time.monotonic_ns()
         reaches, note = self.bender.requested(data)
         self.log.append((now_ns, ">", data, note))
-        if reaches:
-            self._asked_ns = self.to_device.send([Piece(reaches)], now_ns)
+        if reaches:  # with its last character: in how many pieces a request comes says nothing of who sent it
+            self._asked_ns = self.to_device.send([Piece(reaches, at_once=True)], now_ns)
 
     def _from_device(self, fd: int) -> None:
         data = self.device.read(fd)
