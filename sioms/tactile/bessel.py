@@ -12,7 +12,8 @@ from scipy.special import j0, j1
 
 Floats = NDArray[np.float64]
 
-_LARGE = 1e150
+_DECADES = 100
+_LARGE = 10.0**_DECADES
 
 
 def bessel(highest: int, z: Floats) -> Floats:
@@ -45,16 +46,17 @@ def _upwards(highest: int, z: Floats) -> Floats:
 
 def _downwards(highest: int, z: Floats) -> Floats:
     """Begin with anything far above the argument; what comes out is J but for one factor, and J_0 + 2 sum J_2k = 1."""
+    if not z.size:
+        return np.empty((highest + 1, 0))
     begin = 2 * ((highest + int(np.sqrt(160.0 * highest))) // 2)
-    out = np.zeros((highest + 1, z.size))
-    above, here, total = np.zeros(z.size), np.ones(z.size), np.zeros(z.size)
-    for n in range(begin, -1, -1):
-        if n <= highest:
-            out[n] = here
-        if n % 2 == 0:
-            total += here if n == 0 else 2.0 * here
-        above, here = here, 2.0 * n / z * here - above
-        if (large := np.abs(here) > _LARGE).any():
-            for each in (out, above, here, total):
-                each[..., large] /= _LARGE
-    return out / total
+    look = max(1, int(_DECADES / np.log10(2.0 * begin / z.min() + 1.0)))  # steps that grow by _LARGE at most
+    out = np.empty((begin + 2, z.size))
+    out[begin + 1], out[begin] = 0.0, 1.0
+    for n in range(begin, 0, -1):
+        np.divide(2.0 * n, z, out=out[n - 1])
+        out[n - 1] *= out[n]
+        out[n - 1] -= out[n + 1]
+        if n % look == 0 and (large := np.abs(out[n - 1]) > _LARGE).any():
+            out[n - 1 :, large] /= _LARGE
+    out[: highest + 1] /= out[0] + 2.0 * out[2::2].sum(axis=0)
+    return out[: highest + 1]

@@ -90,11 +90,11 @@ class Contact:
     def series(self, angle: float, highest: int) -> Floats:
         """Return [p; q] [Pa], tension positive, with the middle of the strip at `angle` [rad]; length 4 nc + 2."""
         z = self.half_width * np.arange(highest + 1, dtype=np.float64)
-        n = np.arange(self.normal.size)
-        bounded = 1j**n * (n + 1) * _over(n.size, z)
+        n, m = np.arange(self.normal.size), np.arange(self.adhering.size)
+        every = bessel(max(n.size, m.size - 1), z)
+        bounded = 1j**n * (n + 1) * _over(every[:, 1 : n.size + 1], z)
         w = self.half_width * (bounded @ self.normal)
-        m = np.arange(self.adhering.size)
-        q = self.half_width * ((1j**m * bessel(m.size - 1, z)) @ self.adhering) - self.sliding * w
+        q = self.half_width * ((1j**m * every[:, : m.size]) @ self.adhering) - self.sliding * w
         w[0], q[0] = 0.5 * w[0], 0.5 * q[0]
         turn = rotation(angle, highest)
         return np.concatenate([turn @ pack(-w.real, -w.imag), turn @ pack(q.real, q.imag)])
@@ -232,9 +232,9 @@ def _profile_tests(order: int) -> tuple[Floats, Floats]:
     return np.cos(angle), tests
 
 
-def _over(highest: int, z: Floats) -> Floats:
-    """Return J_n(z)/z for n = 1..highest with its limit at 0, shape (len(z), highest)."""
+def _over(values: Floats, z: Floats) -> Floats:
+    """Return J_n(z)/z for n = 1, 2, .. of J_n(z), with its limit at 0, shape (len(z), n)."""
     zero = z == 0.0
-    ratio: Floats = bessel(highest, z)[:, 1:] / np.where(zero, 1.0, z)[:, None]
-    ratio[zero] = 0.5 * np.eye(1, highest)
+    ratio: Floats = values / np.where(zero, 1.0, z)[:, None]
+    ratio[zero] = 0.5 * np.eye(1, values.shape[1])
     return ratio

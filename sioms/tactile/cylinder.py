@@ -160,44 +160,42 @@ def _basis_many(cylinder: Cylinder, k: Extended, r: Extended) -> Extended:
     Lengths are in units of rb for the growing and ra for the decaying solutions; fields of one power share
     one factor.
     """
-    ra, rb = cylinder.core_m, cylinder.outer_m
     kappa = 3.0 - 4.0 * cylinder.poisson
+    out = np.empty((4, 4, k.size, r.size), dtype=np.longdouble)
     k = k[:, None]
-    rows = []
-    for sign, length in ((1.0, rb), (-1.0, ra)):  # upper sign grows outwards, lower sign decays
-        x = r[None, :] / length
+    square = k**2
+    # upper sign grows outwards, lower sign decays
+    for at, sign, length in ((0, 1.0, cylinder.outer_m), (2, -1.0, cylinder.core_m)):
+        x: Extended = r / length
         n, m = 1.0 + sign * k, sign * k - 1.0
-        near = x ** (n - 1.0)
-        far = near / x**2  # x^(m - 1)
+        near: Extended = x ** (n - 1.0)
+        far: Extended = near / x**2  # x^(m - 1)
         # the pair is divided by k^2 and k, so that no column outgrows the other
-        rows.append(
-            np.stack(
-                [
-                    n * (3.0 - n) * near / k**2,
-                    sign * n * (n - 1.0) * near / k**2,
-                    (kappa - n) * near * r / k**2,
-                    sign * (kappa + n) * near * r / k**2,
-                ]
-            )
-        )
-        rows.append(np.stack([-m * far, sign * m * far, -far * r, sign * far * r]) / k)
-    return np.stack(rows, axis=1)
+        out[0, at] = n * (3.0 - n) * near / square
+        out[1, at] = sign * n * (n - 1.0) * near / square
+        out[2, at] = (kappa - n) * near * r / square
+        out[3, at] = sign * (kappa + n) * near * r / square
+        out[0, at + 1] = -m * far / k
+        out[1, at + 1] = sign * m * far / k
+        out[2, at + 1] = -far * r / k
+        out[3, at + 1] = sign * far * r / k
+    return out
 
 
 def _basis_one(cylinder: Cylinder, k: Extended, r: Extended) -> Extended:
     """Return the four solutions of k = 1: translation, n = 2, m = -2, and that of a net force."""
     ra, rb = cylinder.core_m, cylinder.outer_m
     kappa = 3.0 - 4.0 * cylinder.poisson
-    x, y = r / rb, ra / r
-    ln = np.log(x)
-    zero, one = np.zeros_like(r), np.ones_like(r)
-    shift = np.stack([zero, zero, one * rb, -one * rb])
-    bend = np.stack([2.0 * x, 2.0 * x, (kappa - 2.0) * x * r, (kappa + 2.0) * x * r])
-    decay = np.stack([2.0 * y**3, 2.0 * y**3, -(y**3) * r, -(y**3) * r])
-    lift, slide = (2.0 * kappa * ln - 1.0) * rb, -(2.0 * kappa * ln + 1.0) * rb
-    force = np.stack([(3.0 + kappa) / x, (1.0 - kappa) / x, lift, slide])
-    basis: Extended = np.stack([shift, bend, decay, force], axis=1)[:, :, None, :]
-    return np.repeat(basis, k.size, axis=2)
+    x = r / rb
+    cube = (ra / r) ** 3
+    turn = 2.0 * kappa * np.log(x)
+    out = np.empty((4, 4, k.size, r.size), dtype=np.longdouble)
+    out[:2, 0], out[2, 0], out[3, 0] = 0.0, rb, -rb
+    out[:2, 1], out[2, 1], out[3, 1] = 2.0 * x, (kappa - 2.0) * x * r, (kappa + 2.0) * x * r
+    out[:2, 2], out[2:, 2] = 2.0 * cube, -cube * r
+    out[0, 3], out[1, 3] = (3.0 + kappa) / x, (1.0 - kappa) / x
+    out[2, 3], out[3, 3] = (turn - 1.0) * rb, -(turn + 1.0) * rb
+    return out
 
 
 def _match(cylinder: Cylinder, k: Floats, r: Floats, basis: Basis) -> Floats:
@@ -211,8 +209,10 @@ def _match(cylinder: Cylinder, k: Floats, r: Floats, basis: Basis) -> Floats:
     fields = np.einsum("fskr,ksc->fkrc", basis(cylinder, wave, radius), amplitude)
     s_rr, s_rt, u_r, u_t = fields
     u_r, u_t = u_r / (2.0 * cylinder.shear_pa), u_t / (2.0 * cylinder.shear_pa)
-    e_tt = (u_r + wave[:, None, None] * u_t) / radius[None, :, None]
-    return np.stack([s_rr, -s_rt, u_r, -u_t, e_tt]).astype(np.float64)
+    out = np.empty((5, k.size, r.size, 2))
+    out[0], out[1], out[2], out[3] = s_rr, -s_rt, u_r, -u_t
+    out[4] = (u_r + wave[:, None, None] * u_t) / radius[None, :, None]
+    return out
 
 
 @lru_cache(maxsize=16)
@@ -241,8 +241,8 @@ def _solve(matrix: Extended, right: Extended) -> Extended:
         pivot = column + np.abs(table[:, column:, column]).argmax(axis=1)
         table[every, column], table[every, pivot] = table[every, pivot].copy(), table[every, column].copy()
         table[:, column] /= table[:, column, column, None]
-        factor = table[:, :, column].copy()
+        factor: Extended = table[:, :, column, None].copy()
         factor[:, column] = 0.0
-        table -= factor[:, :, None] * table[:, None, column]
+        table -= factor * table[:, None, column]
     answer: Extended = table[:, :, size:].copy()  # a view would keep the whole table, as long as answers are kept
     return answer
