@@ -15,21 +15,15 @@ from typing import NamedTuple
 
 from ownership_cell import Cell, cells
 from ownership_model import follow
-from ownership_promises import Broken, promise
+from ownership_promises import Broken, check_rest, trace
 from ownership_state import (
     CLIENTS,
-    FAULT,
     GUEST,
-    IN,
-    OPEN,
-    UP,
     Action,
-    Device,
-    Driver,
-    Held,
     State,
+    renamed,
 )
-from ownership_steps import actions
+from ownership_steps import BY_ITSELF, actions
 
 BEGINNINGS: dict[str, list[Action]] = {
     "nobody owns anything": [],
@@ -38,31 +32,6 @@ BEGINNINGS: dict[str, list[Action]] = {
     "all is stopped": [("open", 0, 0), ("open", 1, 1), ("stop_node", 2, 1), ("stop", 2)],
 }
 """Where exploring begins: steps after a start at which all have connected and come to rest."""
-
-
-SYSTEM = frozenset(
-    ["notice", "listen", "bury", "start", "beat", "hear", "tick", "see_death", "leave", "boot"]
-)  # fmt: skip
-"""What happens by itself, if nobody asks for anything."""
-
-
-def check_rest(s: State) -> None:
-    """See that nothing is left of who has gone, when all has come to rest.
-
-    Raises:
-        Broken: something is.
-    """
-    for d, device in enumerate(s.devices):
-        promise(device.phase in (UP, FAULT), "a device comes back")
-        promise(device.phase == UP or not (device.claim or device.driver), "nothing is left of a device in fault")
-        if device.phase == FAULT:
-            continue
-        (driver,) = device.driver
-        promise(not device.claim or device.claim[1] == OPEN, "nothing is left of a handle that ends")
-        promise(not device.claim or s.clients[device.claim[0]][0] == IN, "nothing is left of the dead")
-        promise(driver.handle[:1] == device.claim[:1], "daemon and driver agree on who owns an output")
-        promise((driver.stopped, driver.node_stop or s.stopped) == (s.stopped, s.node_stops[d] or s.stopped),
-                 "daemon and driver agree on what is stopped")  # fmt: skip
 
 
 MOST_STEPS_TO_REST = 100
@@ -98,7 +67,7 @@ def begin(name: str) -> list[Action]:
 def settle(state: State) -> tuple[State, list[Action]]:
     """Let all happen that happens by itself; return the rest state, and the way there."""
     way: list[Action] = []
-    while step := next((a for a in actions(state) if a[0] in SYSTEM), None):
+    while step := next((a for a in actions(state) if a[0] in BY_ITSELF), None):
         state, _ = follow(state, step)
         way.append(step)
     return state, way
@@ -187,7 +156,7 @@ def explore_all(way: Iterable[Action], requests: int, deaths: int = 0) -> tuple[
 
 def _cost(action: Action, used: int, died: int, deaths: int) -> tuple[int, int]:
     """Return how many events, and deaths beside them, there have been after an action."""
-    if action[0] in SYSTEM:
+    if action[0] in BY_ITSELF:
         return used, died
     return (used, died + 1) if action[0] in DEATHS and died < deaths else (used + 1, died)
 
@@ -203,7 +172,7 @@ def _after(state: State, action: Action, came: dict[State, tuple[State, Action] 
 def _see_rest(state: State, rests: set[State]) -> None:
     """See that nothing is left of who has gone when all comes to rest; ``rests``: states of which that is known."""
     passed = []
-    while state not in rests and (step := next((a for a in actions(state) if a[0] in SYSTEM), None)):
+    while state not in rests and (step := next((a for a in actions(state) if a[0] in BY_ITSELF), None)):
         passed.append(state)
         if len(passed) > MOST_STEPS_TO_REST:
             raise Broken("all comes to rest")
@@ -211,15 +180,6 @@ def _see_rest(state: State, rests: set[State]) -> None:
     if state not in rests:
         check_rest(state)
     rests.update(passed, [state])
-
-
-def trace(came: dict[State, tuple[State, Action] | None], state: State) -> list[Action]:
-    """Return the steps that lead to a state, up to names."""
-    steps: list[Action] = []
-    while (before := came[state]) is not None:
-        state = before[0]
-        steps.append(before[1])
-    return steps[::-1]
 
 
 def follow_all(
@@ -281,7 +241,7 @@ def _way_back(graph: Graph, state: State) -> list[Action]:
     """Return steps that happen by themselves and lead from outside of a graph into it; none when there are none."""
     steps: list[Action] = []
     while typical(state) not in graph:
-        step = next((a for a in actions(state) if a[0] in SYSTEM), None)
+        step = next((a for a in actions(state) if a[0] in BY_ITSELF), None)
         if step is None:
             return []
         steps.append(step)
@@ -338,7 +298,7 @@ def wander(make: Callable[[], Cell], steps: int, seed: int) -> int:
     chance, walk, seen = random.Random(seed), Walk(make(), begin("nobody owns anything")), set()
     for _ in range(steps):
         choice = list(actions(walk.state))
-        by_itself = [action for action in choice if action[0] in SYSTEM]
+        by_itself = [action for action in choice if action[0] in BY_ITSELF]
         kinds = sorted({str(a[0]) for a in (by_itself if by_itself and chance.random() < 0.5 else choice)})
         kind = chance.choices(kinds, [OFTEN.get(kind, 1.0) for kind in kinds])[0]
         action = chance.choice([action for action in choice if action[0] == kind])
@@ -410,29 +370,6 @@ def run(name: str, depth: int, goes_on: Callable[[], bool] = lambda: True) -> Ex
 
 
 # --- what is alike --------------------------------------------------------------------------------
-
-
-def renamed(s: State, clients: tuple[int, ...], devices: tuple[int, ...]) -> State:
-    """Return a state with clients and devices under other numbers."""
-
-    def held(who: Held) -> Held:
-        return (clients[who[0]], who[1]) if who else who
-
-    def driver(of: Driver) -> Driver:
-        inbox = tuple((v, clients[n] if n >= 0 else n, m) for v, n, m in of.inbox)
-        return of._replace(inbox=inbox, handle=held(of.handle))
-
-    new_clients, new_devices, stops = list(s.clients), list(s.devices), list(s.node_stops)
-    for c, client in enumerate(s.clients):
-        words = client[1]
-        if words.startswith("open"):
-            words = f"open {devices[int(words[-1])]}"
-        new_clients[clients[c]] = (client[0], words)
-    for d, device in enumerate(s.devices):
-        stops[devices[d]] = s.node_stops[d]
-        new_devices[devices[d]] = Device(device.phase, held(device.claim), tuple(map(driver, device.driver)))
-    waiting = tuple((clients[c], devices[d]) for c, d in s.waiting)
-    return s._replace(node_stops=tuple(stops), clients=tuple(new_clients), waiting=waiting, devices=tuple(new_devices))
 
 
 ALIKE = [((*clients, GUEST), devices) for clients in ((0, 1), (1, 0)) for devices in ((0, 1), (1, 0))]

@@ -20,7 +20,6 @@ from ownership_state import (
     DEAD,
     DETACH,
     DETACHED,
-    DEVICES,
     END,
     ENDING,
     FAULT,
@@ -152,8 +151,8 @@ class Step:
             self.answer = "refused"
             return
         self.answer = "done"
-        self.stopped, self.node_stops = False, [False] * DEVICES
-        for d in range(DEVICES):
+        self.stopped, self.node_stops = False, [False] * len(self.devices)
+        for d in range(len(self.devices)):
             if self._driver(d) is not None:
                 inbox = [(VOID if v in (STOP, RESET) else v, n, m) for v, n, m in self.devices[d].driver[0].inbox]
                 self._drive(d, missed=True, asked=False, inbox=tuple(inbox))
@@ -185,12 +184,12 @@ class Step:
 
     def request_stop(self, c: int) -> None:
         self.request = 1
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             if self._driver(d) is not None:
                 self._drive(d, asked=True)
 
     def suspend(self, c: int) -> None:
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             if self.devices[d].claim == (c, OPEN) and self.devices[d].phase == UP:
                 self._send(d, DETACH)
                 self._set(d, claim=(c, TOLD))
@@ -198,7 +197,7 @@ class Step:
     def die(self, c: int, words: int) -> None:
         if self.clients[c][0] == IN:
             self.clients[c] = (DEAD, LAST_WORDS[words])
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             driver = self._driver(d)
             if driver is None:
                 continue
@@ -329,7 +328,7 @@ class Step:
     def _end_session(self, c: int) -> None:
         self.clients[c] = (OUT, "")
         self.waiting = [wait for wait in self.waiting if wait[0] != c]
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             if owns(self.devices[d], c):
                 if self.devices[d].phase == UP:
                     self._send(d, DETACH)
@@ -394,7 +393,7 @@ class Step:
         self.guest = not self.guest
         if self.guest:
             return
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             claim = self.devices[d].claim
             if claim[:1] == (GUEST,) and self.devices[d].phase == UP:
                 self._send(d, DETACH)
@@ -408,7 +407,7 @@ class Step:
         self.daemon = False
         self.clients = [(OUT, "")] * CLIENTS
         self.waiting = []
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             driver = self._driver(d)
             kept = (driver._replace(outbox=(), cut=True),) if driver is not None and driver.alive else ()
             self.devices[d] = Device(driver=kept)
@@ -417,7 +416,7 @@ class Step:
         self.daemon, self.guest = True, True
         self._hear_request() if self.request == 1 else None
         self.request = 0
-        for d in range(DEVICES):
+        for d in range(len(self.devices)):
             self.start(d)
 
 
@@ -427,10 +426,16 @@ def follow(state: State, action: Action) -> tuple[State, str]:
     Raises:
         Broken: a promise does not hold after it.
     """
+    after, answer = taken(state, action)
+    check(after)
+    return after, answer
+
+
+def taken(state: State, action: Action) -> tuple[State, str]:
+    """Take a step, and look at no more than what it takes."""
     step = Step(state)
     getattr(step, str(action[0]))(*action[1:])
     after = step.state()
     if action[0] == "move" and step.answer == "done":
         promise(not after.stopped and not after.node_stops[int(action[2])], "what is stopped takes no motion")
-    check(after)
     return after, step.answer

@@ -5,9 +5,15 @@ from __future__ import annotations
 from ownership_state import (
     ATTACH,
     ENDING,
+    FAULT,
+    IN,
+    OPEN,
     OUT,
+    RESET,
     STOP,
     UP,
+    Action,
+    Driver,
     State,
 )
 
@@ -19,6 +25,12 @@ class Broken(AssertionError):
 def promise(holds: object, what: str) -> None:
     if not holds:
         raise Broken(what)
+
+
+def _stays_stopped(driver: Driver) -> bool:
+    """Tell whether a node is stopped once its driver has heard all that has been said, the workcell being reset."""
+    orders = [verb for verb, *_ in driver.inbox if verb in (STOP, RESET)]
+    return orders[-1] == STOP if orders else driver.node_stop and not (driver.stopped or driver.missed)
 
 
 def check(s: State) -> None:
@@ -39,10 +51,37 @@ def check(s: State) -> None:
                 not driver.moves or (not driver.stopped and not driver.node_stop),
                 "what is stopped does not move",
             )
-            held = driver.node_stop or driver.stopped or STOP in [m[0] for m in driver.inbox] or s.stopped
-            promise(not s.node_stops[d] or not driver.alive or driver.ending or held,
-                     "a stop of a node is not lost")  # fmt: skip
+            gone = not driver.alive or driver.ending
+            promise(not s.node_stops[d] or s.stopped or gone or _stays_stopped(driver), "a stop of a node is not lost")
         promise(not device.claim or device.phase in (UP, ENDING), "nobody owns what is not there")
     for c, d in s.waiting:
         promise(s.clients[c][0] != OUT, "nobody waits who has gone")
         promise(s.devices[d].claim or s.devices[d].phase != UP, "what is free is granted")
+
+
+def check_rest(s: State) -> None:
+    """See that nothing is left of who has gone, when all has come to rest.
+
+    Raises:
+        Broken: something is.
+    """
+    for d, device in enumerate(s.devices):
+        promise(device.phase in (UP, FAULT), "a device comes back")
+        promise(device.phase == UP or not (device.claim or device.driver), "nothing is left of a device in fault")
+        if device.phase == FAULT:
+            continue
+        (driver,) = device.driver
+        promise(not device.claim or device.claim[1] == OPEN, "nothing is left of a handle that ends")
+        promise(not device.claim or s.clients[device.claim[0]][0] == IN, "nothing is left of the dead")
+        promise(driver.handle[:1] == device.claim[:1], "daemon and driver agree on who owns an output")
+        promise((driver.stopped, driver.node_stop or s.stopped) == (s.stopped, s.node_stops[d] or s.stopped),
+                 "daemon and driver agree on what is stopped")  # fmt: skip
+
+
+def trace(came: dict[State, tuple[State, Action] | None], state: State) -> list[Action]:
+    """Return the steps that lead to a state, up to names."""
+    steps: list[Action] = []
+    while (before := came[state]) is not None:
+        state = before[0]
+        steps.append(before[1])
+    return steps[::-1]

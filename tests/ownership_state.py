@@ -88,3 +88,26 @@ class State(NamedTuple):
 def owns(device: Device, c: int) -> bool:
     """Tell whether a client has a device open, and not only one that had its name before."""
     return device.claim[:1] == (c,) and device.claim[1] != ORPHAN
+
+
+def renamed(s: State, clients: tuple[int, ...], devices: tuple[int, ...]) -> State:
+    """Return a state with clients and devices under other numbers."""
+
+    def held(who: Held) -> Held:
+        return (clients[who[0]], who[1]) if who else who
+
+    def driver(of: Driver) -> Driver:
+        inbox = tuple((v, clients[n] if n >= 0 else n, m) for v, n, m in of.inbox)
+        return of._replace(inbox=inbox, handle=held(of.handle))
+
+    new_clients, new_devices, stops = list(s.clients), list(s.devices), list(s.node_stops)
+    for c, client in enumerate(s.clients):
+        words = client[1]
+        if words.startswith("open"):
+            words = f"open {devices[int(words[-1])]}"
+        new_clients[clients[c]] = (client[0], words)
+    for d, device in enumerate(s.devices):
+        stops[devices[d]] = s.node_stops[d]
+        new_devices[devices[d]] = Device(device.phase, held(device.claim), tuple(map(driver, device.driver)))
+    waiting = tuple((clients[c], devices[d]) for c, d in s.waiting)
+    return s._replace(node_stops=tuple(stops), clients=tuple(new_clients), waiting=waiting, devices=tuple(new_devices))

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 
 from ownership_state import (
     DEAD,
-    DEVICES,
     FAULT,
     IN,
     LAST_WORDS,
@@ -21,6 +20,11 @@ from ownership_state import (
     State,
     owns,
 )
+
+BY_ITSELF = frozenset(
+    ["notice", "listen", "bury", "start", "beat", "hear", "tick", "see_death", "leave", "boot"]
+)  # fmt: skip
+"""What happens by itself, if nobody asks for anything."""
 
 
 def actions(s: State) -> Iterator[Action]:
@@ -44,13 +48,18 @@ def actions(s: State) -> Iterator[Action]:
             yield ("beat",)
 
 
+def _may_say(s: State, c: int, words: str) -> bool:
+    """Tell whether a client may end with these words: it asks for what is there and what it has not asked for."""
+    if not words.startswith("open"):
+        return True
+    d = int(words[-1])
+    return d < len(s.devices) and (c, d) not in s.waiting and not owns(s.devices[d], c)
+
+
 def _of_client(s: State, c: int, connected: bool) -> Iterator[Action]:
-    holds = [d for d in range(DEVICES) if s.devices[d].driver and s.devices[d].driver[0].handle == (c, "")]
+    holds = [d for d in range(len(s.devices)) if s.devices[d].driver and s.devices[d].driver[0].handle == (c, "")]
     if connected:
-        for words in range(len(LAST_WORDS)):
-            d = (words - 1) % DEVICES
-            if words in (0, 3) or ((c, d) not in s.waiting and not owns(s.devices[d], c)):
-                yield ("die", c, words)
+        yield from (("die", c, words) for words, said in enumerate(LAST_WORDS) if _may_say(s, c, said))
         if any(device.claim == (c, OPEN) and device.phase == UP for device in s.devices):
             yield ("suspend", c)
         if not s.stopped:
