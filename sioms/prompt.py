@@ -3,6 +3,14 @@
 from __future__ import annotations
 
 import os
+import threading
+import time
+from contextlib import suppress
+
+SHARE = 0.25
+"""Of a processor, what threads that somebody else keeps busy may take in the real-time class."""
+ORDINARY_S = 1.0
+"""How long they are ordinary ones when they have taken more [s]."""
 
 
 def be_prompt() -> bool:
@@ -18,3 +26,57 @@ def be_prompt() -> bool:
     except OSError:
         return False
     return True
+
+
+class BoundedPrompt:
+    """Threads that are prompt as long as they take little: what others send must not take a processor.
+
+    Concurrency: ``enter`` in the threads that are meant, ``look`` in one that calls it about ten times a second.
+    """
+
+    def __init__(self) -> None:
+        self._ran_ns: dict[int, int] = {}
+        self._looked_ns = time.monotonic_ns()
+        self._ordinary_until_ns = 0
+
+    def enter(self) -> None:
+        """Have the thread that calls be one of them; again: nothing."""
+        thread = threading.get_native_id()
+        if thread not in self._ran_ns:
+            self._ran_ns[thread] = _ran_ns(thread) if be_prompt() else -1
+
+    def look(self) -> None:
+        """Make them ordinary when they have taken more than their share since the last look, and prompt again later."""
+        now_ns = time.monotonic_ns()
+        took = 0
+        for thread, before in list(self._ran_ns.items()):
+            if before < 0:
+                continue  # it has no right to the class
+            ran_ns = _ran_ns(thread)
+            if ran_ns < 0:
+                del self._ran_ns[thread]  # it has ended
+                continue
+            took += ran_ns - before
+            self._ran_ns[thread] = ran_ns
+        lasted_ns, self._looked_ns = now_ns - self._looked_ns, now_ns
+        if took > SHARE * lasted_ns:
+            self._set(os.SCHED_OTHER, 0)
+            self._ordinary_until_ns = now_ns + int(ORDINARY_S * 1e9)
+        elif self._ordinary_until_ns and now_ns > self._ordinary_until_ns:
+            self._ordinary_until_ns = 0
+            self._set(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 1)
+
+    def _set(self, policy: int, priority: int) -> None:
+        for thread, ran_ns in self._ran_ns.items():
+            if ran_ns >= 0:
+                with suppress(OSError):
+                    os.sched_setscheduler(thread, policy, os.sched_param(priority))
+
+
+def _ran_ns(thread: int) -> int:
+    """Return how long a thread of this process has run [ns]; -1: it has ended."""
+    try:
+        with open(f"/proc/self/task/{thread}/schedstat", "rb") as file:
+            return int(file.read().split()[0])
+    except OSError:
+        return -1

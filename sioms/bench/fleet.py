@@ -13,13 +13,16 @@ import subprocess
 import sys
 import threading
 import time
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
 from typing import Any, Self
 
 import zenoh
 from zenoh.handlers import Callback
 
 from sioms.check import other_clock
-from sioms.check.daemon import Daemon
+from sioms.check.daemon import Daemon, wait_for
 from sioms.check.remote import Gateway, Relay, ZenohGateway
 from sioms.children import ends_with_us
 from sioms.client.command import command
@@ -33,11 +36,13 @@ from .again import connect_again
 from .figures import Bar, Report
 from .options import Options
 from .reach import fail
-from .watching import HISTORY
+from .watching import HISTORY, Counted, Watch, halting_ns
 from .workcells import axes, workcell
 
-CELLS = 8
+CELLS, AXES = 8, 2
 SPEED = 0.02
+SETTLED_S = 0.1
+"""How long cells have been let alone before a stop [s]."""
 _ECHO = """
 import sys, time, zenoh
 from zenoh.handlers import Callback
@@ -105,10 +110,12 @@ def bench_fleet(options: Options, report: Report) -> None:
     """Stop, start and connect to eight cells over Zenoh; strangers at a gateway."""
     with contextlib.ExitStack() as stack:
         gateways: list[ZenohGateway] = []
+        daemons: list[Daemon] = []
         for i in range(CELLS):
-            text = workcell([axes("mod0", 2, history=8192, limits=False)])
+            text = workcell([axes("mod0", AXES, history=8192, limits=False)])
             text = text.replace('name = "bench"', f'name = "cell{i}"').replace("realtime_priority = 50\n", "")
             daemon = stack.enter_context(Daemon(text))
+            daemons.append(daemon)
             authority = gateways[0].authority if gateways else None
             gateways.append(stack.enter_context(ZenohGateway(daemon.socket, authority=authority)))
             report.progress(f"fleet: cell {i + 1} of {CELLS}")
@@ -120,7 +127,7 @@ def bench_fleet(options: Options, report: Report) -> None:
         time.sleep(0.3)
         cells = {f"cell{i}": gateway.socket for i, gateway in enumerate(gateways)}
         with Fleet(cells, "bench") as fleet:
-            _stops(options, report, fleet, gateways[0])
+            _stops(options, report, fleet, gateways, daemons)
             _starts(options, report, fleet)
         connect_again(options, report, gateways[0])
         _strangers(options, report, gateways[0])
@@ -129,18 +136,35 @@ def bench_fleet(options: Options, report: Report) -> None:
         fail(options, report, daemon, ZenohGateway)
 
 
-def _stops(options: Options, report: Report, fleet: Fleet, gateway: ZenohGateway) -> None:
-    """Stop all cells, and one; each stop follows as many bare rounds."""
+def _stops(
+    options: Options, report: Report, fleet: Fleet, gateways: list[ZenohGateway], daemons: list[Daemon]
+) -> None:  # fmt: skip
+    """Stop all cells while their axes move, and one; each stop follows as many bare rounds."""
     from sioms.check.remote import free_ports
 
-    everywhere, slowest, one, bare = [], [], [], []
-    with BareRound(gateway, free_ports()) as rounds:
-        for trial in range(options.kills(30, 1000)):
+    braking, everywhere, one, bare, counted = [], [], [], [], Counted()
+    pids = {"client": os.getpid()}
+    for i, (daemon, gateway) in enumerate(zip(daemons, gateways, strict=True)):
+        drivers = {f"driver {i}": pid for pid in daemon.device_pids().values()}
+        pids |= {f"daemon {i}": daemon.pid, f"gateway {i}": gateway.process.pid} | drivers
+    worked_ns = 0
+    with contextlib.ExitStack() as stack, BareRound(gateways[0], free_ports()) as rounds:
+        cells = [stack.enter_context(daemon.cell("judge")) for daemon in daemons]
+        nodes = [stack.enter_context(cell.open("mod0", "rw")) for cell in cells]
+        trials = options.kills(30, 1000)
+        for trial in range(trials):
             bare += [rounds.time_ns() for _ in range(4)]
+            for node in nodes:
+                node.write([command(axis, velocity=SPEED) for axis in range(AXES)], replace=True)
+            for node in nodes:
+                wait_for(partial(_cruises, node), 10.0, f"{node.name} to cruise")
+            time.sleep(SETTLED_S)
+            watches, before_ns = [Watch(node) for node in nodes], _worked_ns(pids)
             begin = time.monotonic_ns()
             fleet.emergency_stop("bench")
             everywhere.append(time.monotonic_ns() - begin)
-            slowest.append(max(status["stopped_ns"] for status in fleet.status().values()) - begin)
+            worked_ns += _worked_ns(pids) - before_ns
+            braking.append(max(counted.look(partial(halting_ns, watch, begin)) for watch in watches) - begin)
             fleet.reset()
             begin = time.monotonic_ns()
             fleet["cell0"].emergency_stop_workcell("bench")
@@ -150,10 +174,25 @@ def _stops(options: Options, report: Report, fleet: Fleet, gateway: ZenohGateway
     base = report.samples("bare round of Zenoh under TLS", bare)
     report.samples("stop of one cell to acknowledgement", one, baseline=base)
     report.samples(
-        f"stop of {CELLS} cells to the last acknowledgement", everywhere, "ms", baseline=base,
+        f"stop of {CELLS} cells to the tick in which the last of {CELLS} drivers brakes", braking, "ms", baseline=base,
         bars=[Bar("p50", 5.0), Bar("p99", 10.0)],
     )  # fmt: skip
-    report.samples(f"stop of {CELLS} cells to the last latched", slowest, "ms")
+    counted.tell(report, "brakings")
+    report.samples(f"stop of {CELLS} cells to the last acknowledgement", everywhere, "ms")
+    report.value("processor time of all of them for it [ms]", worked_ns / trials * 1e-6)
+
+
+def _cruises(node: Any) -> bool:
+    return all(abs(speed - SPEED) < 1e-9 for speed in node.read().commanded_velocity)
+
+
+def _worked_ns(pids: Mapping[str, int]) -> int:
+    """Return how long all threads of some processes have run [ns];."""
+    return sum(
+        int(task.joinpath("schedstat").read_text().split()[0])
+        for pid in pids.values()
+        for task in Path(f"/proc/{pid}/task").iterdir()
+    )
 
 
 def _starts(options: Options, report: Report, fleet: Fleet) -> None:

@@ -13,6 +13,7 @@ that its connection was made with.
 from __future__ import annotations
 
 import json
+import os
 from typing import Any
 
 import zenoh
@@ -32,6 +33,11 @@ MOST = MAX_FROM_GATEWAY + 4096
 QUEUES = {"control": 4, "real_time": 2, "interactive_high": 16, "interactive_low": 1, "data_high": 1, "data": 1,
           "data_low": 1, "background": 1}  # fmt: skip
 """Frames are sent with priority ``interactive_high``, stops with ``real_time``, which overtakes them."""
+
+os.environ.setdefault(
+    "ZENOH_RUNTIME",
+    "(acc: (handover: app), rx: (handover: app), tx: (handover: app), app: (worker_threads: 1))",
+)  # read by Zenoh when the first session is opened: a frame changes threads once and not three times
 
 
 def config(folder: Folder, role: str, blocked_us: int = BLOCKED_US, **more: Any) -> zenoh.Config:

@@ -5,9 +5,27 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator
+from typing import NamedTuple
+
+from .ways import Begun
 
 EACH = 8
 """Stops of one certificate that wait at most; of more the first ones do the same."""
+
+
+class Stop(NamedTuple):
+    """A stop that is to be told to the daemon and answered.
+
+    Attributes:
+        name: of the session that it came from.
+        frame: as it came.
+        begun: what ``Ways.begin`` returned for it; came_ns: when that was.
+    """
+
+    name: str
+    frame: bytes
+    begun: Begun | None = None
+    came_ns: int = 0
 
 
 class StopQueue:
@@ -18,16 +36,20 @@ class StopQueue:
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._of: dict[str, deque[tuple[str, bytes]]] = {}
+        self._of: dict[str, deque[Stop]] = {}
         self._is_closed = False
 
-    def put(self, number: str, name: str, frame: bytes) -> bool:
+    def has_room(self, number: str) -> bool:
+        """Tell whether there is room for a stop."""
+        return len(self._of.get(number, ())) < EACH
+
+    def put(self, number: str, stop: Stop) -> bool:
         """Add a stop; return whether there was room for it."""
         with self._changed:
             waiting = self._of.setdefault(number, deque())
             if len(waiting) >= EACH:
                 return False
-            waiting.append((name, frame))
+            waiting.append(stop)
             self._changed.notify()
         return True
 
@@ -37,8 +59,8 @@ class StopQueue:
             self._is_closed = True
             self._changed.notify()
 
-    def __iter__(self) -> Iterator[tuple[str, str, bytes]]:
-        """Wait for stops and return them: number, name, frame; one of each number before a second of any."""
+    def __iter__(self) -> Iterator[tuple[str, Stop]]:
+        """Wait for stops and return them with the number of who asks; one of each number before a second of any."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._of or self._is_closed)
@@ -46,7 +68,7 @@ class StopQueue:
                     return
                 number = next(iter(self._of))
                 waiting = self._of.pop(number)
-                name, frame = waiting.popleft()
+                stop = waiting.popleft()
                 if waiting:
                     self._of[number] = waiting
-            yield number, name, frame
+            yield number, stop

@@ -1,21 +1,24 @@
 """Sessions at the daemon for stops alone, one for each holder of a key: what any transport's way of stops ends in.
 
-Concurrency: one thread of its own, which no other traffic uses.
+Concurrency: one thread of its own, which no other traffic uses; ``Ways.begin`` may be called in any.
 """
 
 from __future__ import annotations
 
 import errno
+import threading
 import time
+from collections.abc import Callable
 from contextlib import suppress
+from typing import TypeAlias
 
 from sioms.client.cell_verbs import request_stop
 from sioms.client.channel import Call, Channel
 from sioms.client.connecting import connect
 from sioms.protocol import link, verbs
 from sioms.protocol.flags import PROTOCOL_VERSION
-from sioms.protocol.link import Down, Up
-from sioms.protocol.messages import refusal, reply
+from sioms.protocol.link import Down, MalformedFrame, Up
+from sioms.protocol.messages import MalformedMessage, refusal, reply
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.text import printable
 
@@ -23,6 +26,8 @@ from .parts import Principal
 
 MOST_WAYS = 64
 """Sessions at the daemon that are kept for the next stop; the oldest gives way."""
+Begun: TypeAlias = Callable[[], bool]
+"""A stop that drivers have been asked for: tells whether they have taken it."""
 
 
 class Way:
@@ -35,6 +40,7 @@ class Way:
     def __init__(self, path: str, who: Principal, host: str) -> None:
         self._channel = Channel(connect(path), "the daemon")
         self._request: StopRequest | None = None
+        self._begins = threading.Lock()
         try:
             self._channel.call(Call("represent", verbs.Represent(who.name, host, list(who.groups))))
             answer = self._channel.call(Call("hello", verbs.Hello(PROTOCOL_VERSION, "stop")))
@@ -43,10 +49,21 @@ class Way:
             self.close()
             raise
 
-    def stop(self, stop: verbs.EmergencyStop) -> int:
-        """Stop, if need be without the daemon; return the instant from which readings show it [ns]."""
-        why = printable(str(stop.why))
-        taken = request_stop(None if stop.node else self._request, why)
+    def begin(self, stop: verbs.EmergencyStop) -> Begun | None:
+        """Have all drivers brake, if it is for the workcell and its holder may stop that. In any thread."""
+        if stop.node:
+            return None
+        with self._begins:  # a descriptor that is closed meanwhile would be another file's
+            return request_stop(self._request, printable(str(stop.why)))
+
+    def stop(self, stop: verbs.EmergencyStop, begun: Begun | None = None) -> int:
+        """Stop, if need be without the daemon; return the instant from which readings show it [ns].
+
+        Args:
+            stop: what is asked for.
+            begun: what ``begin`` returned for it; None: it is to begin now.
+        """
+        taken = begun or self.begin(stop)
         try:
             self._channel.call(Call("emergency stop", stop, enough=taken))
         except OSError:
@@ -57,8 +74,10 @@ class Way:
     def close(self) -> None:
         """End the session."""
         self._channel.close()
-        if self._request is not None:
-            self._request.close()
+        with self._begins:
+            request, self._request = self._request, None
+        if request is not None:
+            request.close()
 
 
 class Ways:
@@ -71,9 +90,32 @@ class Ways:
     def __init__(self, path: str) -> None:
         self._path = path
         self._ways: dict[tuple[Principal, str], Way] = {}
+        self._of: dict[Principal, Way] = {}
 
-    def answer(self, who: Principal, host: str, frame: bytes) -> bytes | None:
+    def begin(self, who: Principal | None, frame: bytes) -> Begun | None:
+        """Have all drivers brake, if a frame stops the workcell and its sender has a session here; it is still to be
+        answered. In any thread, and at once: there is nothing in it that waits.
+
+        Returns:
+            What ``answer`` is to be told; None: it has not begun, and ``answer`` begins it.
+        """
+        way = self._of.get(who) if who is not None else None
+        if way is None:
+            return None
+        try:
+            kind, _, _, _, packet = link.unpack(frame, link.MAX_TO_GATEWAY)
+            message = verbs.take(packet, verbs.FROM_CLIENT)[1] if kind == Up.PACKET else None
+        except (MalformedFrame, MalformedMessage):
+            return None
+        return way.begin(message) if isinstance(message, verbs.EmergencyStop) else None
+
+    def answer(self, who: Principal, host: str, frame: bytes, begun: Begun | None = None) -> bytes | None:
         """Obey a frame of a client; return the frame that answers it, None for one that draws no answer.
+
+        Args:
+            who, host: whose it is, and where that is.
+            frame: as it came.
+            begun: what ``begin`` returned for it.
 
         Raises:
             MalformedFrame, MalformedMessage: it is none.
@@ -86,16 +128,18 @@ class Ways:
         number, message = verbs.take(packet, verbs.FROM_CLIENT)
         if kind != Up.PACKET or not isinstance(message, verbs.EmergencyStop):
             return None
-        return link.pack(Down.PACKET, body=self._stop(who, host, number, message))
+        return link.pack(Down.PACKET, body=self._stop(who, host, number, message, begun))
 
-    def _stop(self, who: Principal, host: str, number: int, message: verbs.EmergencyStop) -> bytes:
+    def _stop(
+        self, who: Principal, host: str, number: int, message: verbs.EmergencyStop, begun: Begun | None = None
+    ) -> bytes:
         for attempt in (0, 1):
             try:
-                return reply(number, None, self._way(who, host).stop(message))
+                return reply(number, None, self._way(who, host).stop(message, None if attempt else begun))
             except OSError as error:
                 way = self._ways.pop((who, host), None) if error.errno == errno.EIO else None
                 if way is not None:  # the daemon has been started again since
-                    way.close()
+                    self._drop(who, way)
                 if way is not None and not attempt:
                     continue
                 return refusal(number, error.errno or errno.EIO, error.strerror or str(error))
@@ -104,13 +148,20 @@ class Ways:
     def _way(self, who: Principal, host: str) -> Way:
         way = self._ways.get((who, host))
         if way is None:
-            way = self._ways[who, host] = Way(self._path, who, host)
+            way = self._ways[who, host] = self._of[who] = Way(self._path, who, host)
             if len(self._ways) > MOST_WAYS:
-                self._ways.pop(next(iter(self._ways))).close()
+                oldest = next(iter(self._ways))
+                self._drop(oldest[0], self._ways.pop(oldest))
         return way
+
+    def _drop(self, who: Principal, way: Way) -> None:
+        if self._of.get(who) is way:
+            del self._of[who]
+        way.close()
 
     def close(self) -> None:
         """End them all."""
         for way in self._ways.values():
             way.close()
         self._ways.clear()
+        self._of.clear()

@@ -14,6 +14,7 @@ import os
 import re
 import socket
 import threading
+import time
 import traceback
 from collections import Counter, deque
 from contextlib import suppress
@@ -25,12 +26,12 @@ from zenoh.handlers import Callback
 from sioms.client.certificates import NUMBERS, own
 from sioms.client.keys import Folder
 from sioms.client.zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint
-from sioms.prompt import be_prompt
+from sioms.prompt import BoundedPrompt, be_prompt
 from sioms.protocol import link
 from sioms.protocol.link import Down, MalformedFrame
 from sioms.protocol.messages import MalformedMessage
 
-from .stop_queue import StopQueue
+from .stop_queue import Stop, StopQueue
 from .ways import Ways
 
 if TYPE_CHECKING:
@@ -41,6 +42,10 @@ TURN = 200
 """Frames of clients that are taken before others have their turn."""
 MOST_QUEUED = 1000
 """Frames of the holder of a certificate that wait to be taken; what comes above is dropped, which ends its session."""
+MOMENT_S = 0.004
+"""How long after the drivers the daemon is told of a stop [s], so that it does not hold up those of other workcells on
+this machine.
+"""
 _NAME = re.compile(r"sioms/[a-z]+/(cert-0[0-9]{3})/([0-9a-f]{16})")
 
 
@@ -117,6 +122,7 @@ class Zenoh:
         self._publishers: dict[bytes, zenoh.Publisher] = {}
         self._came = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
         loop.add(self._came, self._heard)
+        self._prompt = BoundedPrompt()
         self._stops = StopQueue()
         self._ways = Ways(path)
         self._thread = threading.Thread(target=self._run_stops, name="stops over Zenoh", daemon=True)
@@ -164,6 +170,7 @@ class Zenoh:
             os.eventfd_write(self._came, 1)
 
     def _frame(self, sample: zenoh.Sample) -> None:
+        self._prompt.enter()
         if sample.kind == zenoh.SampleKind.PUT:
             self._queue(sample, sample.payload.to_bytes())
 
@@ -172,9 +179,13 @@ class Zenoh:
             self._queue(sample, None)
 
     def _stop(self, sample: zenoh.Sample) -> None:
+        """Have the drivers brake, and leave all else to the thread of stops."""
+        self._prompt.enter()
         found = _NAME.fullmatch(str(sample.key_expr))
-        if found and sample.kind == zenoh.SampleKind.PUT:
-            self._stops.put(found[1], found[2], sample.payload.to_bytes())
+        if found and sample.kind == zenoh.SampleKind.PUT and self._stops.has_room(found[1]):
+            frame = sample.payload.to_bytes()
+            begun = self._ways.begin(self._loop.principal(found[1]), frame)
+            self._stops.put(found[1], Stop(found[2], frame, begun, time.monotonic_ns()))
 
     # --- the loop --------------------------------------------------------------------------------
 
@@ -232,7 +243,8 @@ class Zenoh:
         )
 
     def look(self) -> None:
-        """Forget sessions that have ended."""
+        """Forget sessions that have ended, and let nobody keep a processor busy ahead of ordinary processes."""
+        self._prompt.look()
         for peer in [each for each in self._publishers if each not in self._gateway.sessions]:
             self._publishers.pop(peer).undeclare()  # type: ignore[no-untyped-call]
 
@@ -240,13 +252,15 @@ class Zenoh:
 
     def _run_stops(self) -> None:
         be_prompt()
-        for number, name, frame in self._stops:
+        for number, stop in self._stops:
             try:
+                if stop.begun is not None:
+                    time.sleep(max(0.0, MOMENT_S - 1e-9 * (time.monotonic_ns() - stop.came_ns)))
                 who = self._loop.principal(number)
-                answer = self._ways.answer(who, self._host(number), frame) if who else None
+                answer = self._ways.answer(who, self._host(number), stop.frame, stop.begun) if who else None
                 if answer:
                     self._session.put(
-                        f"{DOWN}/{number}/{name}", answer, congestion_control=zenoh.CongestionControl.BLOCK,
+                        f"{DOWN}/{number}/{stop.name}", answer, congestion_control=zenoh.CongestionControl.BLOCK,
                         priority=zenoh.Priority.REAL_TIME, express=True,
                     )  # fmt: skip
             except (zenoh.ZError, MalformedFrame, MalformedMessage):

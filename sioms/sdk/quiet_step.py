@@ -57,7 +57,7 @@ of it."""
 HALTS: Final = 1
 STOPS: Final = 2
 """How axes brake: as those whose owner has gone, or latched."""
-MOMENT_NS: Final = 2_000_000
+MOMENT_NS: Final = 4_000_000
 """How long the loop leaves the processor to devices that have yet to show that they brake, and to the daemon and the
 client, who have the answer by then.
 """

@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import os
 import threading
+from typing import Any
 
 import pytest
 
+from sioms import prompt
 from sioms.gateway import stops, zenoh
-from sioms.prompt import be_prompt
+from sioms.prompt import BoundedPrompt, be_prompt
 
 
 def test_one_thread_is_ahead_of_ordinary_ones_and_no_other() -> None:
@@ -38,3 +40,32 @@ def test_stops_of_a_gateway_are_passed_on_by_such_a_thread(run: object, monkeypa
         monkeypatch.setattr(module, "be_prompt", ask)
     with pytest.raises(Asked):
         run(object())  # type: ignore[operator]
+
+
+def test_threads_that_others_keep_busy_are_ordinary_for_a_while(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns, ran_ns, classes = [0], {11: 5}, list[int]()
+    monkeypatch.setattr(prompt, "be_prompt", lambda: True)
+    monkeypatch.setattr(prompt, "_ran_ns", lambda thread: ran_ns.get(thread, -1))
+    monkeypatch.setattr(prompt.time, "monotonic_ns", lambda: now_ns[0])
+    monkeypatch.setattr(prompt.threading, "get_native_id", lambda: 11)
+    monkeypatch.setattr(prompt.os, "sched_setscheduler", lambda thread, policy, _: classes.append(policy))
+    bounded: Any = BoundedPrompt()
+
+    def look(took: float) -> list[int]:
+        now_ns[0] += 100_000_000
+        ran_ns[11] += int(took * 100_000_000)
+        classes.clear()
+        bounded.look()
+        return list(classes)
+
+    bounded.enter()
+    bounded.enter()
+    assert look(0.2) == []
+    assert look(0.9) == [os.SCHED_OTHER]
+    assert all(look(0.0) == [] for _ in range(10)), "not at once again"
+    assert look(0.0) == [os.SCHED_FIFO | os.SCHED_RESET_ON_FORK]
+    ran_ns.clear()
+    ran_ns[12] = 0
+    now_ns[0] += 100_000_000
+    bounded.look()
+    assert not bounded._ran_ns, "a thread that has ended is none"
