@@ -1,7 +1,7 @@
 """Rig: devices of one process and their ticks, on a clock and timers of the rig's own.
 
-Runtimes, steps (as Python) and the process of several devices are the real ones, over real descriptors; the devices do
-nothing but note when they tick.
+Runtimes, steps (as Python) and the process of several devices are the real ones, over real descriptors; unless a driver
+is given, the devices do nothing but note when they tick.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from own_writes_rig import _in_python, _memory
 
+import sioms.motion.bank
+import sioms.sdk.desk
 import sioms.sdk.group
 import sioms.sdk.quiet
 from sioms.protocol.driver_verbs import DriverVerb
@@ -29,7 +32,7 @@ from sioms.protocol.markers import TABLE_SIZE
 from sioms.protocol.messages import encode
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import AnalogBlock, BlockSpec, Description
-from sioms.sdk.driver import Kit, TickDriver
+from sioms.sdk.driver import Driver, Kit, TickDriver
 from sioms.sdk.group import Group, Member
 from sioms.sdk.runtime import Runtime
 
@@ -148,7 +151,9 @@ class Ticker(TickDriver):
 class Device:
     """A device of the process, and the daemon's end of its socket."""
 
-    def __init__(self, group: Group, latch: int, request: int, hz: float, phase: float) -> None:
+    def __init__(
+        self, group: Group, latch: int, request: int, hz: float, phase: float, driver: type[Driver], table: Any
+    ) -> None:
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         self.control = ours
         self.control.setblocking(False)
@@ -161,9 +166,9 @@ class Device:
         fds = [theirs.detach(), *files]
         self._kept = [files[0], *files[3:]]
         """What the runtime has mapped, and does not close: its process would."""
-        self.runtime = Runtime(Ticker, "dev", Table(hz), 1, options, fds)
+        self.runtime = Runtime(driver, "dev", table, 1, options, fds)
         self.runtime.sees_requests = True
-        self.driver: Ticker = self.runtime.driver  # type: ignore[assignment]
+        self.driver: Any = self.runtime.driver
         self.member = Member(self.runtime, [], 0, "")
         group._members[self.runtime.poll_fd] = self.member
         group._epoll.register(self.runtime.poll_fd)
@@ -186,8 +191,17 @@ class Device:
 class Process:
     """Devices in one process; nothing happens in it but what the test has happen."""
 
-    def __init__(self, hz: Sequence[float], phases: Sequence[float], steps: ModuleType) -> None:
+    def __init__(
+        self,
+        hz: Sequence[float],
+        phases: Sequence[float],
+        steps: ModuleType,
+        driver: type[Driver] = Ticker,
+        table: Callable[[float], Any] = Table,
+    ) -> None:
         self._steps = steps
+        self.served = 0
+        """How many packets steps have served."""
         ours, self._fork_server = socket.socketpair()
         self.group = Group(ours)
         latch, self.request = _memory(LATCH_SIZE), _memory(4096)
@@ -195,8 +209,10 @@ class Process:
 
         self.latch = Latch(memoryview(mmap.mmap(latch, LATCH_SIZE)))
         self.latch.daemon_alive(CLOCK.now_ns)
-        made = [Device(self.group, latch, self.request, *each) for each in zip(hz, phases, strict=True)]
-        self.devices = made
+        self.devices = [
+            Device(self.group, latch, self.request, rate, phase, driver, table(rate))
+            for rate, phase in zip(hz, phases, strict=True)
+        ]
         os.close(latch)
 
     def look(self) -> None:
@@ -247,6 +263,12 @@ def _drain(sock: socket.socket) -> None:
         return
 
 
+def _make(record: Any, **fields: Any) -> None:
+    """Make a record for steps in Python, whatever the library is."""
+    for name, value in fields.items():
+        setattr(record, name, value.reshape(-1).data if isinstance(value, np.ndarray) else value)
+
+
 def _wait_for(groups: list[Group]) -> Callable[[int, Any, int], int]:
     def wait_for(poll: int, ready: Any, timeout_ms: int) -> int:
         assert timeout_ms == 0, "who waits for its turn does not sleep"
@@ -261,9 +283,30 @@ def _wait_for(groups: list[Group]) -> Callable[[int, Any, int], int]:
 def processes() -> Iterator[Callable[..., Process]]:
     """Give what makes a process of devices with rates [Hz] and phases, in the rig's time."""
     made: list[Process] = []
-    with _in_python("sioms.sdk.quiet_step") as steps:
+    with (
+        _in_python("sioms.sdk.quiet_step") as steps,
+        _in_python("sioms.sdk.serve_step") as serving,
+        _in_python("sioms.motion.plain_step") as plain,
+    ):
         pass  # the records of all other steps are what they are
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(steps.Quiet, "__init__", lambda self, **fields: self.__dict__.update(fields))
+        for record in (serving.Desk, serving.StopFile, plain.Plain):
+            patch.setattr(record, "__init__", _make)
+        patch.setattr(sioms.sdk.desk, "Desk", serving.Desk)
+        patch.setattr(sioms.sdk.desk, "StopFile", serving.StopFile)
+        patch.setattr(sioms.motion.bank, "plain_of", plain.plain_of)
+        patch.setattr(serving, "clock_ns", CLOCK)
+        patch.setattr(serving, "admits", plain.admits)
+        for name in ("is_requested", "is_unread", "writer_of"):
+            patch.setattr(steps, name, getattr(serving, name))
+
+        def serve_packet(desk: Any, who: int, tick: int) -> int:
+            left: int = serving.serve_packet(desk, who, tick)
+            made[-1].served += not left
+            return left
+
+        patch.setattr(steps, "serve_packet", serve_packet)
         groups: list[Group] = []
 
         def set_timer(fd: int, when_ns: int) -> int:
@@ -274,7 +317,6 @@ def processes() -> Iterator[Callable[..., Process]]:
         patch.setattr(steps, "wait_for", _wait_for(groups))
         patch.setattr(steps, "expirations", lambda fd: next(t for t in CLOCK.timers if t.fd == fd).expirations())
         patch.setattr(steps, "set_timer", set_timer)
-        patch.setattr(steps.Quiet, "__init__", lambda self, **fields: self.__dict__.update(fields))
         patch.setattr(steps.Quiet, "address", property(id))
         patch.setattr(sioms.sdk.quiet, "Quiet", steps.Quiet)
         for name in ("begin_halt", "begin_stop", "wait_turn"):
@@ -284,8 +326,8 @@ def processes() -> Iterator[Callable[..., Process]]:
         patch.setattr(time, "monotonic_ns", CLOCK)
         patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
 
-        def make(hz: Sequence[float], phases: Sequence[float]) -> Process:
-            made.append(Process(hz, phases, steps))
+        def make(hz: Sequence[float], phases: Sequence[float], *kind: Any) -> Process:
+            made.append(Process(hz, phases, steps, *kind))
             groups[:] = [made[-1].group]
             return made[-1]
 

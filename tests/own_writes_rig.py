@@ -257,7 +257,7 @@ class World:
             module.clock_ns, module.wait_for = CLOCK, self._wait_for
             module.expirations = lambda fd: runtime._timer.expirations() if fd == 1 else 1
             module.set_timer = lambda fd, when_ns: 0
-            module.is_requested = serving.is_requested
+            module.is_requested, module.is_unread = serving.is_requested, serving.is_unread
             module.wait_for_one = lambda fd, until_ns: 0
             self.run_quietly = module.run
             return QuietRun(

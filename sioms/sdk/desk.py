@@ -36,7 +36,7 @@ class WriteDesk:
         blocks: of the device.
         clients: its handles.
         stops, pages: of the process.
-        request: descriptor of the stop-request file; below 0: others look at it, and no writes are served by steps.
+        request: descriptor of the stop-request file.
         gives_way: whether processes of the same priority may run after every packet.
         period_ns: of its ticks [ns].
     """
@@ -48,10 +48,10 @@ class WriteDesk:
         self._clients, self._stops, self._pages = clients, stops, pages
         self._writers: list[Handle] = []
         self._packets = np.zeros(MOST_KEPT * ROOM, dtype=np.uint8)
-        axes = [block for block in blocks if isinstance(block, AxisBlock)] if request >= 0 else []
+        axes = [block for block in blocks if isinstance(block, AxisBlock)]
         plain = axes[0].bank.plain if axes else None
         self._block = axes[0] if plain is not None else None
-        self.request = StopFile(there=int(request >= 0), file=request, word=0, changed=0)
+        self.request = StopFile(there=1, file=request, word=0, changed=0)
         """What is seen of the file."""
         if plain is None:
             self.record = Desk.empty()

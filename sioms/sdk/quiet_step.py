@@ -256,9 +256,9 @@ def begin_halt(q: Quiet, now_ns: int) -> int:
 @step
 def begin_to_brake(q: Quiet, now_ns: int, latches: int, since_ns: int) -> int:
     """Have the device begin to stop, as from an instant since its last tick, with a tick soon; return whether it has
-    refused.
+    refused. Where writes have been served they come before the stop, and the loop works them in.
     """
-    if q.stop(q.device, now_ns, latches, since_ns):
+    if q.desk.kept or q.stop(q.device, now_ns, latches, since_ns):
         return 1
     q.brakes = STOPS if latches else HALTS
     q.braked_ns = now_ns
@@ -487,7 +487,7 @@ def heed(q: Quiet, count: int) -> int:
             left += 1
         elif found == HEARD:
             heard = 1
-    if left == 1 and not heard and not q.left:
+    if left == 1 and not heard and not q.left and not q.told and not q.slackens:
         who = writer_of(q.desk, q.ready[0])
         if who >= 0 and serve_writer(q, who) == DONE:
             left = 0

@@ -150,8 +150,6 @@ class Runtime:
         self._announced = self._slack_ns = self._spare_until_ns = 0
         self._expired, self.sees_requests = 0, False
         self._quiet: QuietRun | None = None
-        self._is_alone = False
-        """Whether the process is this device's alone."""
 
     # --- services to the driver (Kit) ------------------------------------------------------------
 
@@ -243,7 +241,6 @@ class Runtime:
 
     def run(self, priority: int, user: str) -> int:
         """Tick until told to end; return the exit status."""
-        self._is_alone = True
         self._watch_requests()  # before that user may not look at it any more
         settle(priority, user, self.log)
         try:
@@ -275,9 +272,8 @@ class Runtime:
         """Return what ticks by compiled steps; None where a tick has to look at more than they do."""
         if self._stops_workcell or self.pages.watch or not self.sees_requests:
             return None
-        request = self._request_fd if self._is_alone else -1
         desk = WriteDesk(
-            self.blocks, self.clients, self.stops, self.pages, request, self.turns.gives_way, self.period_ns
+            self.blocks, self.clients, self.stops, self.pages, self._request_fd, self.turns.gives_way, self.period_ns
         )
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._control.fileno(),
