@@ -142,7 +142,7 @@ def course(axis: Watched, normal: Normal, offset_s: float) -> Figure:
     groups = _groups(list(watch.blocks))
     last = watch.blocks[-1].end_s if watch.blocks else 0.0
     hours = np.array([(g[-1].end_s - last) / 3600.0 for g in groups])
-    each = [estimate(g, normal.loads, normal.edges, normal.scatter, normal.noise) for g in groups]
+    each = [estimate(g, normal.loads, normal.edges, normal.scatter, normal.noise, about.travel) for g in groups]
     for panel, (at, title, unit) in zip(panels, shown, strict=True):
         value = np.array([e.theta[at] for e in each])
         sure = np.array([np.sqrt(e.noise[at, at]) for e in each])

@@ -24,6 +24,8 @@ WINDOWS = (3, 6, 12, 24)
 #: Judgements one after the other that agree before a drift is told with a name; with an open cause; and before it is
 #: over.
 AGREE, OPEN, OVER = 3, 9, 12
+#: An edge of the reference counts where the commanded speed was the same for so long [s], within this share of it.
+STEADY_S, STEADY = 0.03, 0.02
 #: Blocks that are kept.
 KEPT = 400
 #: A drift is serious from this share of the usual force on, or where a place or a play changes by this share of the
@@ -157,7 +159,7 @@ class AxisWatch:
         return judged
 
     def _refer(self, samples: Samples, edges: Iterable[float]) -> None:
-        """Read the place of the axis at the edges of its reference."""
+        """Read the place of the axis at the edges of its reference that it passes at a steady speed."""
         self._edges += edges
         if not len(samples):
             return
@@ -165,11 +167,17 @@ class AxisWatch:
         for at in [e for e in self._edges if e <= last]:
             i = int(np.searchsorted(samples.time_s, at))
             if 0 < i < len(samples) and samples.time_s[i] - samples.time_s[i - 1] < 1.5 * self.about.tick_s:
-                way = float(np.sign(samples.speed[i]))
+                way = float(np.sign(samples.speed[i])) if self._is_steady(samples, i) else 0.0
                 place = float(np.interp(at, samples.time_s[i - 1 : i + 1], samples.position[i - 1 : i + 1]))
                 if way:
                     self._collector.cross(Crossing(place, int(way)))
         self._edges = [e for e in self._edges if e > last]
+
+    def _is_steady(self, samples: Samples, i: int) -> bool:
+        """Return whether the speed has been the same for a while: in a play the flank that bears follows from that."""
+        before = max(i - round(STEADY_S / self.about.tick_s), 0)
+        speed = samples.speed[before : i + 1]
+        return bool(np.ptp(speed) <= STEADY * abs(float(speed[-1])))
 
     def _take(self, block: Block) -> None:
         self.blocks.append(block)
@@ -228,7 +236,7 @@ class AxisWatch:
         return self._of(normal, list(self.blocks)[-count:])
 
     def _of(self, normal: Normal, blocks: Sequence[Block]) -> Finding:
-        now = estimate(blocks, normal.loads, normal.edges, normal.scatter, normal.noise)
+        now = estimate(blocks, normal.loads, normal.edges, normal.scatter, normal.noise, self.about.travel)
         return judge(normal, now, self.about.travel)
 
     def _since(self, normal: Normal, finding: Finding) -> float:
@@ -237,7 +245,7 @@ class AxisWatch:
         scale = float(finding.change @ weight)
         sums, best, start = 0.0, 0.0, self.blocks[-1].start_s
         for block in reversed(self.blocks):
-            one = estimate([block], normal.loads, normal.edges, normal.scatter, normal.noise)
+            one = estimate([block], normal.loads, normal.edges, normal.scatter, normal.noise, self.about.travel)
             unsure = np.diag(one.noise) > 1e3 * np.abs(finding.change) ** 2 + 1e6 * np.diag(normal.own)
             off = np.where(unsure, 0.0, one.theta - normal.theta)
             along = float(np.where(unsure, 0.0, weight) @ off)

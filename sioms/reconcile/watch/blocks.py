@@ -18,8 +18,8 @@ from .rows import MASS, SIZE, Rows
 MOTION_S, MOVES, LONGEST_S = 20.0, 6, 3600.0
 #: Share of the moves that tell the least and the greatest mass; crossings that are kept of a block.
 EXTREME, MOST_CROSSINGS = 0.25, 64
-#: A mass is told by a move whose acceleration explains this many times what is left.
-TOLD = 100.0
+#: A mass is told by a move whose acceleration explains this many times what is left: to a percent.
+TOLD = 1e4
 
 
 @dataclass(frozen=True, slots=True)

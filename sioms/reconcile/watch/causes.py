@@ -24,9 +24,11 @@ LEFT, RIVAL = 25.0, 16.0
 NEEDED = 20.0
 #: A change bends the other numbers, too: by this share of its force.
 BENT = 0.05
-#: Causes that a reference tells; a play of at least this share of the smallest that has a column is seen, if at least
-#: this share of the mass is behind it.
-BY_REFERENCE, SMALLEST, BEHIND = ("place", "scale"), 0.5, 0.15
+#: A play of at least this share of the smallest that has a column is seen, if at least this share of the mass is behind
+#: it.
+SMALLEST, BEHIND = 0.5, 0.15
+#: A reference tells a play whose standard deviation is such a share of it.
+TOLD_PLAY = 0.2
 #: What orders an unexplained change.
 ORDERED = {
     "mass": "acceleration", "viscous": "speed", "dry": "direction of motion", "constant": "nothing: it is constant",
@@ -138,9 +140,10 @@ def judge(normal: Normal, now: Estimate, travel: float) -> Finding:
     slack[at, at] += (BENT * bent / np.maximum(normal.per, 1e-300)) ** 2
     places = np.abs(change[[PLACE, PLAY]]).max() if cover[PLACE, PLACE] < UNKNOWN / 2 else 0.0
     slack[[PLACE, PLAY], [PLACE, PLAY]] += (BENT * places) ** 2
+    slack[SCALE, SCALE] += (BENT * places / travel) ** 2
     loose = {cause.name: _fit(cause, normal.theta, change, slack) for cause in CAUSES}
     names = _names({name: left for name, (left, *_) in loose.items()})
-    if len(names) == 1 and names[0] in BY_REFERENCE and not _without_play(normal, now, change, travel):
+    if names == ("place",) and not _without_play(normal, now, change, travel):
         names = (*names, "backlash")
     scores = change**2 / np.diag(cover)
     ordered = ORDERED[ALL_NAMES[int(np.argmax(scores))]]
@@ -160,14 +163,14 @@ def _without_loads(normal: Normal, change: Array, cover: Array) -> tuple[Array, 
 
 
 def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -> bool:
-    """Say whether a shift of the reference's edges cannot be play: by which flank bears at each, play shifts them, too.
+    """Say whether a shift of the reference's edges cannot be play, which shifts them by the flank that bears.
 
-    A play that does it is at least twice the shift, and the mass behind it would show at reversals of force. Every size
-    from there on is tried by itself: of all sizes at once only their sum shows, and what is too small to show in it
-    hides the rest. What is too small for any column is not told apart.
+    At a steady speed it shifts them all alike, or by the way in which they are passed, so it is no scale. A play that
+    makes a shift is at least twice as large, and the mass behind it would show at reversals of force. Every size from
+    there on is tried by itself: of all sizes at once only their sum shows, and what is too small to show in it hides
+    the rest. What is too small for any column is not told apart.
     """
-    spread = max(normal.edges, default=0.0) - min(normal.edges, default=0.0)
-    gap = 2.0 * max(abs(float(change[PLACE])), abs(float(change[SCALE])) * spread) / travel
+    gap = 2.0 * abs(float(change[PLACE])) / travel
     if gap <= SMALLEST * PLAYS[0]:
         return False
     plays = slice(GAP, GAP + len(PLAYS))
@@ -230,8 +233,9 @@ def _size(
     if cause.name != "backlash":
         return float(along[0]), half
     play, known = now.theta[PLAY] - normal.theta[PLAY], now.noise[PLAY, PLAY]
-    if known < UNKNOWN / 2:
-        return float(play), 1.96 * float(np.sqrt(known + normal.own[PLAY, PLAY]))
+    known = float(np.sqrt(known + normal.own[PLAY, PLAY]))
+    if known < TOLD_PLAY * abs(play):
+        return float(play), 1.96 * known
     weight = np.maximum(along[:3], 0.0) * PLAYS
     gap = travel * float(weight @ PLAYS / max(weight.sum(), 1e-300))
     return gap, 0.7 * gap

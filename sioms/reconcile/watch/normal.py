@@ -13,7 +13,7 @@ import numpy as np
 
 from .blocks import Block, solved
 from .moves import Array
-from .rows import GAP, MASS, NAMES, SIZE
+from .rows import CONSTANT, DRY, GAP, MASS, NAMES, SIZE, VISCOUS
 
 ALL_NAMES = (*NAMES, "place", "scale", "play")
 TOTAL = len(ALL_NAMES)
@@ -26,14 +26,24 @@ FEWEST = 20
 IDLE_SHARE = 0.006
 #: The same for the place of a reference, of the travel and in steps of the encoder, and for its scale.
 IDLE_PLACE, IDLE_STEPS, IDLE_SCALE = 1e-5, 2.0, 2e-4
-#: Masses of moves that differ by this share of the least are of loads that change.
-LOADS = 0.03
+#: Masses of moves that differ by this share of the least are of loads that change: cogging alone makes 4 %.
+LOADS = 0.08
 #: What varies in commissioning may vary by so many times as much (in variance): it has not seen everything.
 UNSEEN = 1.5
+#: A day's temperature changes friction by such a share (one standard deviation: some 2 % a kelvin of a grease's
+#: viscosity, a quarter of that for what is dry); a commissioning shorter than a day has not seen all of it.
+HEAT_VISCOUS, HEAT_DRY, DAY_S = 0.1, 0.025, 86400.0
 #: Neighbouring rows and the model's own errors leave fewer independent rows than there are: at least so many times.
 DEPENDENT = 2.0
+#: The model's own error, of the usual force, may look like any of its columns: what the moves hardly tell apart is not
+#: known better than it allows.
+MODEL_SHARE = 0.002
+#: Numbers by which blocks from before and after a change differ.
+FRICTIONS = (VISCOUS, DRY, CONSTANT)
 #: A variance beyond all: the number is not known.
 UNKNOWN = 1e12
+#: What place and play of a reference, of the travel, and its scale may be at most (one standard deviation).
+MOST_PLACE, MOST_SCALE = 0.1, 0.1
 #: Crossings within this share of the travel are of one edge.
 ONE_EDGE = 0.01
 
@@ -44,7 +54,7 @@ class Normal:
 
     Attributes:
         theta: numbers, shape (TOTAL,), those of the reference zero.
-        own: covariance of their own variation, shape (TOTAL, TOTAL).
+        own: covariance of their own variation, and of how well they are known, shape (TOTAL, TOTAL).
         noise: variance of a force that the model leaves, with its correlation, [N^2].
         force: root mean square of the force that moves the axis [N].
         per: force of each number's unit: root mean squares of the columns, shape (SIZE,).
@@ -83,13 +93,15 @@ class Estimate:
     rows: int
 
 
-def estimate(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, noise: float) -> Estimate:
+def estimate(
+    blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, noise: float, travel: float
+) -> Estimate:
     """Return the numbers of some blocks.
 
     Args:
         loads: each move has a mass of its own; that of the lightest is told.
-        edges, scatter: of the reference.
-        noise: variance of a row; what these blocks leave counts if it is more.
+        edges, scatter: of the reference; travel: of the axis.
+        noise: variance of a row; what these blocks leave, or by how much they differ, counts if it is more.
     """
     gram, rows = np.sum([b.gram for b in blocks], axis=0), sum(b.rows for b in blocks)
     theta, cover = np.zeros(TOTAL), np.zeros((TOTAL, TOTAL))
@@ -100,39 +112,65 @@ def estimate(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatt
         theta[at] = found
         masses = np.array([b.least for b in blocks if np.isfinite(b.least)])
         theta[MASS] = float(np.mean(masses)) if len(masses) else 0.0
-        cover[MASS, MASS] = float(np.var(masses)) / len(masses) if len(masses) > 2 else UNKNOWN
+        told = float(np.var(masses)) / len(masses) if len(masses) > 2 else UNKNOWN
     else:
         found, inverse, left = solved(gram)
         at = np.arange(SIZE)
         theta[:SIZE] = found
     left = left / max(rows - SIZE, 1)
-    cover[np.ix_(at, at)] = max(noise, DEPENDENT * left) * inverse
-    _refer(blocks, edges, scatter, theta, cover)
+    row = max(noise, DEPENDENT * left) + MODEL_SHARE**2 * float(gram[-1, -1])
+    cover[np.ix_(at, at)] = row * inverse
+    if loads:  # a move's mass is what the other numbers leave: their errors are in it
+        beside = gram[MASS, at] / gram[MASS, MASS] if gram[MASS, MASS] > 0.0 else np.zeros(len(at))
+        cover[MASS, at] = cover[at, MASS] = -row * (inverse @ beside)
+        cover[MASS, MASS] = told + row * float(beside @ inverse @ beside)
+    few = [int(np.flatnonzero(at == number)[0]) for number in FRICTIONS]
+    apart = max(_apart(blocks, loads, theta[list(FRICTIONS)]) - row, 0.0)
+    cover[np.ix_(FRICTIONS, FRICTIONS)] += apart * inverse[np.ix_(few, few)]
+    _refer(blocks, edges, scatter, travel, theta, cover)
     return Estimate(theta, cover, left, gram, rows)
 
 
-def _refer(blocks: Sequence[Block], edges: Sequence[float], scatter: float, theta: Array, cover: Array) -> None:
-    """Fill in place, scale and play of the reference."""
-    unknown = np.diag([UNKNOWN] * 3)
+def _apart(blocks: Sequence[Block], loads: bool, together: Array) -> float:
+    """Return the variance of a row that would make blocks as different as they are, in frictions and constant force.
+
+    Blocks from before and after a change, of moves at different speeds, have sums of which neither friction comes out,
+    and that with a small error; it is seen by each block alone.
+
+    Args:
+        together: FRICTIONS of all of them.
+    """
+    n = len(blocks)
+    if n < 2:
+        return 0.0
+    few = [number - 1 if loads else number for number in FRICTIONS]
+    squares = []
+    for block in blocks:
+        theta, inverse, _ = solved(block.freed if loads else block.gram)
+        off = theta[few] - together
+        squares.append(float(off @ np.linalg.solve(inverse[np.ix_(few, few)], off)) / len(few))
+    return float(np.mean(squares)) * n / (n - 1)
+
+
+def _refer(
+    blocks: Sequence[Block], edges: Sequence[float], scatter: float, travel: float, theta: Array, cover: Array
+) -> None:
+    """Fill in place, scale and play of the reference; what its crossings do not tell apart stays so, by covariance.
+
+    One edge tells the place and so much times the scale together, crossings in one way the place and half the play.
+    """
+    cover[SIZE:, SIZE:] = np.diag([UNKNOWN] * 3)
     places = np.array([(c.place, c.way) for b in blocks for c in b.crossings], dtype=np.float64).reshape(-1, 2)
-    cover[SIZE:, SIZE:] = unknown
     if not edges or len(places) < 4:
         return
-    nearest = np.abs(places[:, :1] - np.array(edges)).argmin(axis=1)
-    marks, way = np.array(edges)[nearest], places[:, 1]
+    marks = np.array(edges)[np.abs(places[:, :1] - np.array(edges)).argmin(axis=1)]
     off = places[:, 0] - marks
-    columns = [np.ones(len(off))]
-    known = [PLACE]
-    if len(set(nearest.tolist())) > 1:
-        columns.append(marks)
-        known.append(SCALE)
-    if abs(float(np.mean(way))) < 0.9:
-        columns.append(0.5 * way)
-        known.append(PLAY)
-    x = np.column_stack(columns)
-    inverse = np.linalg.pinv(x.T @ x)
-    theta[known] = inverse @ x.T @ off
-    cover[np.ix_(known, known)] = max(scatter, 1e-12) ** 2 * inverse
+    x = np.column_stack([np.ones(len(off)), marks, 0.5 * places[:, 1]]) / max(scatter, 1e-12)
+    prior = np.diag(1.0 / np.array([MOST_PLACE * travel, MOST_SCALE, MOST_PLACE * travel]))
+    q, r = np.linalg.qr(np.vstack([x, prior]))
+    back = np.linalg.inv(r)
+    theta[SIZE:] = back @ (q[: len(off)].T @ off) / max(scatter, 1e-12)
+    cover[SIZE:, SIZE:] = back @ back.T
 
 
 def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
@@ -152,19 +190,23 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     spread = float(np.median(most - least)) if len(least) else 0.0
     loads = len(least) > 0 and spread > LOADS * abs(float(np.median(least)))
     edges, scatter = _edges(blocks, travel, step)
-    whole = estimate(blocks, loads, edges, scatter, 0.0)
+    whole = estimate(blocks, loads, edges, scatter, 0.0, travel)
     noise = _noise(blocks, loads, edges, scatter, whole.left)
+    whole = estimate(blocks, loads, edges, scatter, noise, travel)
     theta = whole.theta.copy()
     per = np.sqrt(np.diag(whole.gram)[:SIZE] / whole.rows)
     force = float(np.sqrt(whole.gram[-1, -1] / whole.rows))
-    own = _own(blocks, loads, edges, scatter, noise, theta)
+    own = _own(blocks, loads, edges, scatter, noise, travel, theta)
     floor = np.zeros(TOTAL)
     floor[:SIZE] = IDLE_SHARE * force / np.maximum(per, 1e-300)
     floor[[PLACE, PLAY]] = IDLE_PLACE * travel + IDLE_STEPS * step + scatter
     floor[SCALE] = IDLE_SCALE
+    unseen = max(0.0, 1.0 - (blocks[-1].end_s - blocks[0].start_s) / DAY_S)
+    heat = np.zeros(TOTAL)
+    heat[[VISCOUS, DRY]] = HEAT_VISCOUS * theta[VISCOUS], HEAT_DRY * theta[DRY]
     return Normal(
-        theta, UNSEEN * own + np.diag(floor**2), noise, force, per, loads, low, high, edges, scatter,
-        float(np.mean([b.error for b in blocks])), len(blocks), blocks[-1].end_s,
+        theta, whole.noise + UNSEEN * own + np.diag(floor**2 + unseen * heat**2), noise, force, per, loads, low, high,
+        edges, scatter, float(np.mean([b.error for b in blocks])), len(blocks), blocks[-1].end_s,
     )  # fmt: skip
 
 
@@ -189,7 +231,7 @@ def _edges(blocks: Sequence[Block], travel: float, step: float) -> tuple[tuple[f
 
 def _noise(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, left: float) -> float:
     """Return the variance of a row that makes neighbouring blocks as different as they are."""
-    each = [estimate([b], loads, edges, scatter, 0.0) for b in blocks]
+    each = [estimate([b], loads, edges, scatter, 0.0, 1.0) for b in blocks]
     ratios = []
     for one, two in pairwise(each):
         change = (two.theta - one.theta)[:GAP]
@@ -199,12 +241,18 @@ def _noise(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter
 
 
 def _own(
-    blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, noise: float, theta: Array
+    blocks: Sequence[Block],
+    loads: bool,
+    edges: Sequence[float],
+    scatter: float,
+    noise: float,
+    travel: float,
+    theta: Array,
 ) -> Array:
     """Return the covariance of how the numbers vary by themselves, over minutes, beyond what noise explains."""
     few = GROUP if len(blocks) >= LEAST_GROUPS * GROUP else max(len(blocks) // LEAST_GROUPS, 1)
     groups = [blocks[i : i + few] for i in range(0, len(blocks) - few + 1, few)]
-    each = [estimate(g, loads, edges, scatter, noise) for g in groups]
+    each = [estimate(g, loads, edges, scatter, noise, travel) for g in groups]
     covers = np.stack([e.noise for e in each])
     told = np.stack([np.diag(c) < UNKNOWN / 2 for c in covers])
     off = np.where(told, np.stack([e.theta for e in each]) - theta, 0.0)

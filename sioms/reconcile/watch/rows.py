@@ -6,7 +6,7 @@ a, v, j, s: derivatives of the measured position; w: where the motor stands in t
 sizes, so that m is the mass behind the play: that mass makes the gap's way beside the motor whenever the force turns.
 l and g take up what a late drive and a transmission that yields leave, so that they pass for nothing else. All
 columns and the force go through the same Gaussian filter, which keeps the equation true of the filtered ones; rows
-are taken a width apart.
+are taken a width apart, at steady speed all together.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from .moves import Array, Samples
+from .moves import Array, Flags, Samples
 
 #: The numbers of an axis that moves tell, in the order of all vectors.
 NAMES = ("mass", "viscous", "dry", "constant", "lag", "give", "gap0", "gap1", "gap2")
@@ -31,6 +31,8 @@ APART = 1.0
 SLOW, SLOW_EVER = 0.06, 0.01
 #: A flank pushes clearly where the acceleration passes this share of its greatest value in the move.
 TURNS = 0.15
+#: A commanded speed that changes by less than this share of the greatest is steady.
+STEADY = 0.01
 #: Sizes of play that the columns are made for, of the travel of the axis.
 PLAYS = np.array([2e-4, 6e-4, 1.8e-3])
 
@@ -117,14 +119,30 @@ def rows_of(move: Samples, tick_s: float, greatest_speed: float, gaps: Array, kn
     table = np.column_stack([taken[:, 2], v, sign, np.ones(len(v)), taken[:, 3], taken[:, 4], bears])
     if known is not None:
         u = u - known(taken[:, 0] + move.position[0], v, u)
-    good = np.abs(v) > least
+    # where the axis stood within the filter's reach, dry friction was whatever held it
+    slowest = np.abs(windows(_spread(speed, half), taps)[::stride]).min(axis=1)
+    good = (np.abs(v) > least) & (slowest > SLOW_EVER * greatest_speed)
     if np.count_nonzero(good) < SIZE + 1:
         return None
     error = move.command - move.position
+    commanded = windows(move.speed, taps)[::stride]
+    rows = _together(np.column_stack([table, u]), good, np.ptp(commanded, axis=1) < STEADY * fastest)
     return Rows(
-        table[good], u[good], float(np.mean(error**2)), len(move) * tick_s, float(move.time_s[-1]), fastest,
+        rows[:, :-1], rows[:, -1], float(np.mean(error**2)), len(move) * tick_s, float(move.time_s[-1]), fastest,
         float(np.mean(move.position)),
     )  # fmt: skip
+
+
+def _together(rows: Array, good: Flags, steady: Flags) -> Array:
+    """Make one row of each stretch of steady speed, with the weight of all of them.
+
+    There only disturbances change the speed, and they change the force, too: row by row the one seems to follow from
+    the other.
+    """
+    level = good & steady
+    bounds = np.flatnonzero(np.diff(level.astype(np.int8), prepend=0, append=0)).reshape(-1, 2)
+    means = [rows[first:last].sum(axis=0) / np.sqrt(last - first) for first, last in bounds.tolist()]
+    return np.vstack([rows[good & ~steady], *means])
 
 
 def _spread(values: Array, half: int) -> Array:

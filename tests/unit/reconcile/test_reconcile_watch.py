@@ -9,13 +9,25 @@ import pytest
 
 from sioms.documents import json_of, json_text
 from sioms.reconcile.watch.axis import About, AxisWatch, Settings
-from sioms.reconcile.watch.blocks import solved
+from sioms.reconcile.watch.blocks import Block, Collector, Crossing, solved
 from sioms.reconcile.watch.causes import judge
 from sioms.reconcile.watch.keep import packed, restore
 from sioms.reconcile.watch.moves import Cutter, Samples
-from sioms.reconcile.watch.normal import ALL_NAMES, TOTAL, Estimate, Normal
+from sioms.reconcile.watch.normal import ALL_NAMES, TOTAL, Estimate, Normal, estimate, learn
 from sioms.reconcile.watch.propose import Gains, margin
-from sioms.reconcile.watch.rows import CONSTANT, DRY, GAP, MASS, PLAYS, SIZE, VISCOUS, kernels, rows_of, wind_up
+from sioms.reconcile.watch.rows import (
+    CONSTANT,
+    DRY,
+    GAP,
+    MASS,
+    PLAYS,
+    SIZE,
+    VISCOUS,
+    Rows,
+    kernels,
+    rows_of,
+    wind_up,
+)  # fmt: skip
 
 TICK_S = 0.001
 ABOUT = About("mod0.xaxis", False, TICK_S, 100.0, 0.4, 1e-6, 0.5)
@@ -162,6 +174,93 @@ def test_a_place_is_told_though_the_smallest_play_would_not_show() -> None:
     assert "backlash" in judge(was, now(place=2e-5), 0.4).names, "so small a play shows in no column"
 
 
+def blocks_at(
+    rng: np.random.Generator, speeds: list[float], dry: float, viscous: float = 8.0, noise: float = 0.1
+) -> list[Block]:
+    """Blocks of moves to and fro, each at a speed of its own, of an axis of 2 kg with some force noise [N]."""
+    collector, found = Collector(), list[Block]()
+    for number, speed in enumerate(speeds * 6):
+        t = np.linspace(0.0, 1.0, 500)
+        v = (-1.0) ** number * speed * np.clip(8.0 * np.minimum(t, 1.0 - t), 0.1, 1.0)
+        x = np.zeros((500, SIZE))
+        x[:, MASS], x[:, VISCOUS], x[:, DRY], x[:, CONSTANT] = np.gradient(v, t * 4.0), v, np.sign(v), 1.0
+        x[:, CONSTANT + 1 :] = rng.standard_normal((500, SIZE - CONSTANT - 1))
+        y = 2.0 * x[:, MASS] + viscous * v + dry * np.sign(v) + 0.5 + noise * rng.standard_normal(500)
+        block = collector.add(Rows(x, y, 1e-10, 4.0, 40.0 * number, speed, 0.0))
+        found += [block] if block is not None else []
+    return found
+
+
+def test_blocks_of_before_and_after_a_change_are_no_finding_of_both() -> None:
+    """Slow moves before, fast ones after more dry friction: together they look like a steep viscous friction."""
+    rng = np.random.default_rng(4)
+    slow, fast = blocks_at(rng, [0.1, 0.11], 3.0), blocks_at(rng, [0.2, 0.21], 4.4)
+    for some in (slow, fast):
+        pure = estimate(some, False, (), 0.0, 0.02, 0.4)
+        sd = np.sqrt(np.diag(pure.noise))
+        assert abs(pure.theta[VISCOUS] - 8.0) < 4.0 * sd[VISCOUS] < 2.0
+    both = estimate(slow + fast, False, (), 0.0, 0.02, 0.4)
+    assert both.theta[VISCOUS] > 14.0, "sums of both do not tell either"
+    assert abs(both.theta[VISCOUS] - 8.0) < 5.0 * np.sqrt(both.noise[VISCOUS, VISCOUS]), "and that shows"
+
+
+def referred(
+    blocks: list[Block], rng: np.random.Generator, edges: tuple[float, ...], scale: float = 0.0
+) -> list[Block]:
+    """The same blocks with crossings of a reference to and fro, whose position is scaled."""
+    passed = [(edge * (1.0 + scale), way) for edge in edges for way in (-1, 1, -1, 1)]
+    return [
+        replace(b, crossings=tuple(Crossing(at + 1e-6 * rng.standard_normal(), way) for at, way in passed))
+        for b in blocks
+    ]
+
+
+def test_one_edge_does_not_tell_a_shift_from_a_scale() -> None:
+    rng = np.random.default_rng(6)
+    speeds, both = [0.05, 0.1, 0.2, 0.3], (0.03, 0.08)
+    was = learn(referred(blocks_at(rng, speeds * 5, 3.0), rng, both), 0.4, 1e-6)
+    assert was.edges == pytest.approx(both, abs=1e-5)
+    later = blocks_at(rng, speeds, 3.0)
+    for edges, names in ((both, {"scale"}), (both[:1], {"scale", "place"})):
+        seen = estimate(referred(later, rng, edges, 0.005), False, was.edges, was.scatter, was.noise, 0.4)
+        assert set(judge(was, seen, 0.4).names) >= names, edges
+    assert judge(was, seen, 0.4).names != ("place",)
+
+
+def test_an_edge_counts_where_the_speed_is_steady() -> None:
+    """While an axis brakes, the other flank of a play may bear."""
+    watch, n = AxisWatch(ABOUT, Settings()), 1200
+    t = TICK_S * np.arange(n)
+    speed = 0.2 * np.clip(4.0 * np.minimum(t, t[-1] - t), 0.0, 1.0)
+    x = np.cumsum(speed) * TICK_S
+    move = replace(samples(x, np.ones(n)), speed=speed)
+    watch.feed(move.and_then(samples(np.full(200, x[-1]), np.zeros(200), 1.2, slice(0, 0))), [0.1, 0.6, 1.1])
+    (crossing,) = watch._collector.crossings
+    assert crossing.place == pytest.approx(float(np.interp(0.6, t, x)), abs=1e-6) and crossing.way == 1
+
+
+def test_what_is_normal_is_known_no_better_than_its_noise_allows() -> None:
+    errors = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        known = learn(blocks_at(rng, [0.1] * 20, 3.0, noise=8.0), 0.4, 1e-6)
+        errors.append((known.theta[VISCOUS] - 8.0) / np.sqrt(known.own[VISCOUS, VISCOUS]))
+        assert abs(errors[-1]) < 3.0
+    assert 0.3 < np.sqrt(np.mean(np.square(errors))) < 1.3
+
+
+def test_a_short_commissioning_has_not_seen_what_a_day_does_to_friction() -> None:
+    blocks = blocks_at(np.random.default_rng(2), [0.05, 0.1, 0.2, 0.3] * 5, 3.0)
+    warmer = blocks_at(np.random.default_rng(3), [0.05, 0.1, 0.2, 0.3], 2.9, 6.4)  # 20 % less viscous friction
+    worn = blocks_at(np.random.default_rng(3), [0.05, 0.1, 0.2, 0.3], 3.0, 18.0)
+    hour, day = (
+        learn([replace(b, start_s=b.start_s * s, end_s=b.end_s * s) for b in blocks], 0.4, 1e-6) for s in (1.0, 30.0)
+    )
+    now_warmer, now_worn = (estimate(some, False, (), 0.0, 0.02, 0.4) for some in (warmer, worn))
+    assert judge(day, now_warmer, 0.4).is_drift and not judge(hour, now_warmer, 0.4).is_drift
+    assert "viscous friction" in judge(hour, now_worn, 0.4).names
+
+
 def test_the_state_comes_back_and_damaged_state_is_left_out() -> None:
     watch = AxisWatch(ABOUT, Settings())
     watch.normal, watch.motion_s = normal(), 1234.5
@@ -189,6 +288,47 @@ def test_a_margin_is_that_of_the_loop() -> None:
     assert margin(gains.scaled(400.0, 20.0), 2.0, 0.0, TICK_S) == 0.0, "so stiff it is unstable"
     same = gains.scaled(2.0, 2.0)
     assert margin(same, 4.0, 0.0, TICK_S) == pytest.approx(margin(gains, 2.0, 0.0, TICK_S), rel=1e-6)
+
+
+def test_frictions_come_out_of_slow_moves_that_begin_from_rest() -> None:
+    """Dry friction at rest is whatever holds it: rows that reach there would make a steep viscous friction of it."""
+    production = pytest.importorskip("sioms.reconcile_selftest.production", exc_type=ImportError)
+    drawn = production.draw_machine(77, 0)
+    body = drawn.body._replace(ripple=0.0, rise=0.0)
+    sums, rng = np.zeros((SIZE + 1, SIZE + 1)), np.random.default_rng(1)
+    for number in range(60):
+        goals = (-1.0) ** number * 0.1 * np.array([1.0, -1.0])
+        command, speed = production.smooth(*goals, (0.08, 0.15)[number // 2 % 2], 1.5)
+        move = production.run(replace(drawn, body=body), body, command, speed, 0.0, rng)
+        rows = rows_of(samples(move.position, move.force), TICK_S, drawn.speed, PLAYS * 2 * drawn.travel, None)
+        assert rows is not None
+        table = np.column_stack([rows.x, rows.y])
+        sums += table.T @ table
+    found = solved(sums)[0][[MASS, VISCOUS, DRY]]
+    assert found == pytest.approx([body.mass, body.viscous, body.dry], rel=0.01)
+
+
+@pytest.mark.parametrize(("speeds", "acceleration"), [((0.167,), 6.6), ((0.12, 0.2), 4.0)])
+def test_cogging_at_a_steady_speed_is_no_friction(speeds: tuple[float, ...], acceleration: float) -> None:
+    """It changes speed and force together: row by row the one seems to follow from the other."""
+    production = pytest.importorskip("sioms.reconcile_selftest.production", exc_type=ImportError)
+    drawn = production.draw_machine(78, 1)
+    body, rng = drawn.body._replace(rise=0.0), np.random.default_rng(3)
+    collector, blocks, at, number = Collector(), list[Block](), 0.0, 0
+    while len(blocks) < 6:
+        goal = rng.uniform(-0.27, 0.27)
+        if abs(goal - at) < 0.02:
+            continue
+        number += 1
+        command, speed = production.smooth(at, goal, speeds[number % len(speeds)], acceleration)
+        move = production.run(replace(drawn, body=body), body, command, speed, 0.0, rng)
+        seen = replace(samples(move.position, move.force, 5.0 * number), command=command, speed=speed)
+        rows, at = rows_of(seen, TICK_S, drawn.speed, PLAYS * 2 * drawn.travel, None), goal
+        block = None if rows is None else collector.add(rows)
+        blocks += [] if block is None else [block]
+    found = estimate(blocks, False, (), 0.0, 0.0, 2 * drawn.travel)
+    off = found.theta[[MASS, VISCOUS, DRY]] - [body.mass, body.viscous, body.dry]
+    assert np.all(np.abs(off) < 2.5 * np.sqrt(np.diag(found.noise)[[MASS, VISCOUS, DRY]]))
 
 
 def test_the_numbers_of_a_simulated_production_come_out_and_a_weaker_drive_scales_them() -> None:
