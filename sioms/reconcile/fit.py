@@ -82,8 +82,13 @@ class Problem:
 
     def answer(self, model: AxisModel, force: Array) -> Array:
         """Return the innovation [{x}] that an unmodelled force on the motor, shape (n,) or (n, k), leaves."""
+        return self.answering(model)(force)
+
+    def answering(self, model: AxisModel) -> Callable[[Array], Array]:
+        """Return ``answer`` of a model, for many forces."""
         packed = pack(model)
-        return response(replace(model, inertia=inertia(packed)), self.noise, force, linked(packed))
+        rigid, pair = replace(model, inertia=inertia(packed)), linked(packed)
+        return lambda force: response(rigid, self.noise, force, pair)
 
     def _lost(self, run: Run) -> float:
         """Return the innovation beyond which a run has lost the measurement; infinite where it never has."""

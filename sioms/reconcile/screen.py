@@ -9,7 +9,7 @@ P.-O. Vandanjon, "A new closed-loop output error method", IEEE T-CST 21 (2013) 4
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -171,12 +171,12 @@ def screen(problem: Problem, fit: Fit, names: list[str], levels: Mapping[str, fl
     q = orthonormal(fit.jacobian[rows])
     rest = fit.residual[rows] - q @ (q.T @ fit.residual[rows])
     dead = dead_band(problem, fit.model)
-    travel = range_of(motions)
+    travel, filtered = range_of(motions), _filter(problem, fit)
     out = []
     for name in names:
         effect = lib[name]
         if effect.trials is None:
-            out.append(_screen_state(problem, fit, effect, motions, q, rest, dead, travel, levels or {}))
+            out.append(_screen_state(filtered, fit, effect, motions, q, rest, dead, travel, levels or {}))
         else:
             out.extend(_screen_trials(problem, fit, effect, q, rest, levels or {}))
     return sorted((s for s in out if s is not None), key=lambda s: -s.gain)
@@ -259,14 +259,15 @@ def orthonormal(j: Array) -> Array:
     return basis
 
 
-def _filtered(problem: Problem, fit: Fit, columns: list[Array]) -> Array:
-    """Pass force columns of every record into the domain of the residual, shape (n, k)."""
-    e: Array = problem.join([problem.answer(fit.model, c) for c in columns]) / problem.noise.innovation
-    return e * problem.slope(fit.residual)[:, None]
+def _filter(problem: Problem, fit: Fit) -> Callable[[list[Array]], Array]:
+    """Return what passes force columns of every record into the domain of the residual, shape (n, k), thinned."""
+    rows, answer = thinned(len(fit.residual)), problem.answering(fit.model)
+    slope = problem.slope(fit.residual)[rows, None]
+    return lambda columns: problem.join([answer(c) for c in columns])[rows] / problem.noise.innovation * slope
 
 
 def _screen_state(
-    problem: Problem,
+    filtered: Callable[[list[Array]], Array],
     fit: Fit,
     effect: Effect,
     motions: list[Motion],
@@ -278,9 +279,7 @@ def _screen_state(
 ) -> Start | None:
     best: Start | None = None
     for shape in [laid(effect, motions, travel)] if effect.over else shapes(effect, fit.model, travel):
-        f = _filtered(problem, fit, [state_columns(effect, fit.model, m, shape, dead) for m in motions])[
-            thinned(len(fit.residual))
-        ]
+        f = filtered([state_columns(effect, fit.model, m, shape, dead) for m in motions])
         f = f - q @ (q.T @ f)
         size = np.linalg.norm(f, axis=0)
         keep = size > 1e-9

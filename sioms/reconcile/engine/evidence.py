@@ -92,20 +92,19 @@ def place(
         shuffled: the residual in other orders that keep its memory.
         scale: what one of the residual is in the unit of the picture.
     """
-    share = explained(residual, bins)
-    chance = [explained(r, bins) for r in shuffled]
+    count, level = np.maximum(np.bincount(bins), 1), residual.mean()  # the same in any order
+    whole = max(float(np.sum((residual - level) ** 2)), 1e-300)
+
+    def explained(r: Array) -> float:
+        """Return the share of the variance between bins."""
+        return float(np.sum(count * (np.bincount(bins, weights=r) / count - level) ** 2)) / whole
+
+    share = explained(residual)
+    chance = [explained(r) for r in shuffled]
     p = (1 + sum(c >= share for c in chance)) / (len(chance) + 1)
-    count = np.maximum(np.bincount(bins), 1)
     mean = np.bincount(bins, weights=residual) / count
     spread = np.sqrt(np.maximum(np.bincount(bins, weights=residual**2) / count - mean**2, 0.0))
     return Place(variable, unit, share, p, np.bincount(bins, weights=values) / count, mean * scale, spread * scale)
-
-
-def explained(r: Array, bins: NDArray[np.int64]) -> float:
-    """Return the share of the variance of r between bins."""
-    count = np.maximum(np.bincount(bins), 1)
-    mean = np.bincount(bins, weights=r) / count
-    return float(np.sum(count * (mean - r.mean()) ** 2) / max(np.sum((r - r.mean()) ** 2), 1e-300))
 
 
 def unseen(columns: Array, r: Array, fold: NDArray[np.int64], ridges: Iterable[float]) -> Array:

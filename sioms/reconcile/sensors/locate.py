@@ -19,16 +19,18 @@ def locate(subject: Subject, model: SensorModel, rng: np.random.Generator, shift
     e = -data.miss(data.predict(model))
     out = []
     told = subject.views()
+    orders: dict[int, list[Array]] = {}  # of each view, in which all its variables are tried
     for name, unit, view, values, own in subject.variables(data):
         mine = np.flatnonzero(data.view == view)
         r = e[mine]
         if len(r) < 40 or np.ptp(values) == 0.0:
             continue
-        parts = np.split(r, np.flatnonzero(np.diff(data.block[mine])) + 1)
-        shuffled = (_shuffled(parts, rng) for _ in range(shifts))
+        if view not in orders:
+            parts = np.split(r, np.flatnonzero(np.diff(data.block[mine])) + 1)
+            orders[view] = [_shuffled(parts, rng) for _ in range(shifts)]
         shown = told[data.views[view]]
         bins = bins_of(values) if own is None else own
-        out.append(place(f"{name} ({shown.title})", unit, r, values, bins, shuffled, shown.floor))
+        out.append(place(f"{name} ({shown.title})", unit, r, values, bins, orders[view], shown.floor))
     # whatever else changed meanwhile goes with the time: it comes first only where nothing else explains a third as
     # much
     return sorted(out, key=lambda q: -q.explained / (3.0 if q.variable.startswith("time (") else 1.0))
