@@ -35,6 +35,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         )
         of.add_argument("--seed", type=whole(), default=1, help="seed of permutations and bootstrap")
         of.add_argument("--quiet", action="store_true", help="do not show progress")
+        of.add_argument("--no-pictures", action="store_true", help="write the report without pictures, in less time")
         if subject.live is not None:
             group.add_argument("--yes", action="store_true", help="move without asking")
             group.add_argument("--socket", metavar="PATH", help="the daemon's socket")
@@ -205,7 +206,7 @@ def _write(args: argparse.Namespace, subject: Subject, verdict: Any, seconds: fl
     from sioms.reconcile.report.words import summary
 
     out: Path = args.out
-    write_report(verdict, out, seconds)
+    write_report(verdict, out, seconds, draw=not args.no_pictures)
     subject.write(args, verdict)
     print("\n".join(summary(verdict, str(out / "report.html"))))
 

@@ -55,7 +55,7 @@ def solve(folder: Path, subject: str, *options: str, report: str = "report") -> 
     """
     out = folder / report
     command = [sys.executable, "-P", "-m", "sioms.reconcile", subject, str(folder)]
-    command += ["--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet", *options]
+    command += ["--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet", "--no-pictures", *options]
     done = subprocess.run(
         command,
         capture_output=True,

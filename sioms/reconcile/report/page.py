@@ -25,11 +25,11 @@ SESSION = {
 }
 
 
-def page(v: Verdict, seconds: float) -> Page:
-    """Make the page."""
+def page(v: Verdict, seconds: float, *, draw: bool = True) -> Page:
+    """Make the page, with pictures if they are to be drawn."""
     p = Page(f"{v.nominal.name}: simulation against measurement")
     try:
-        drawn = pictures(v)
+        drawn = pictures(v) if draw else {}
     except ImportError:
         drawn = {}
         p.text("Pictures need matplotlib (the extra report).")
