@@ -1,11 +1,13 @@
 """The whole workflow on four axes of an independent continuous-time generator, and a small blind self-test.
 
-The truth stands here, not beside the data; the solver is a process of its own in the self-test.
+The truth stands here, not beside the data; the solver is a process of its own in the self-test. Two records of four
+say enough of an axis that hides something; one that hides nothing is silent in all four.
 """
 
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -24,21 +26,23 @@ from sioms.reconcile_selftest.score import score
 AXES = Path(__file__).parent / "reconcile_axes"
 
 
-def answer(name: str, out: Path) -> tuple[int, dict[str, object]]:
-    status = reconcile.main(["axis", str(AXES / name), "--out", str(out), "--quiet"])
+def answer(folder: Path, out: Path) -> tuple[int, dict[str, object]]:
+    status = reconcile.main(["axis", str(folder), "--out", str(out), "--quiet"])
     return status, json.loads((out / "verdict.json").read_text())
 
 
 @pytest.mark.usefixtures("without_pictures")
 def test_nothing_hidden_is_silent(tmp_path: Path) -> None:
-    status, found = answer("s05", tmp_path)
+    status, found = answer(AXES / "s05", tmp_path)
     assert status == 0
     assert found["verdict"] == "none"
     assert found["effects"] == []
 
 
 def test_stribeck_friction_is_named_with_its_parameters_and_the_gap_closes(tmp_path: Path) -> None:
-    status, found = answer("s18", tmp_path)
+    for name in ("nominal.json", "rec_0.npz", "rec_1.npz"):
+        shutil.copy(AXES / "s18" / name, tmp_path)
+    status, found = answer(tmp_path, tmp_path / "report")
     assert status == 0
     assert found["effects"] == ["stribeck"]
     values = found["parameters"]["stribeck"]  # type: ignore[index]
@@ -50,17 +54,17 @@ def test_stribeck_friction_is_named_with_its_parameters_and_the_gap_closes(tmp_p
     assert {"force, short windows", "force, closed loop", "position, closed loop"} <= told.keys()
     assert all(g["closed"] > 0.95 for name, g in told.items() if "whole" not in name)
     assert gaps["force, closed loop"]["after"] == pytest.approx(gaps["force, closed loop"]["floor"], rel=0.34)
-    page = (tmp_path / "report.html").read_text()
+    page = (tmp_path / "report" / "report.html").read_text()
     assert "Stribeck" in page
     assert "data:image/png" in page
     assert "src='http" not in page
-    corrected = read_model(tmp_path / "model.toml")
+    corrected = read_model(tmp_path / "report" / "model.toml")
     assert corrected.effects["stribeck"]["Fc"] == values["Fc"]
 
 
 @pytest.mark.usefixtures("without_pictures")
 def test_one_cruising_speed_leaves_coulomb_and_viscous_friction_open(tmp_path: Path) -> None:
-    status, found = answer("s16", tmp_path)
+    status, found = answer(AXES / "s16", tmp_path)
     assert status == 4
     sets = [set(found["effects"]), *map(set, found["alternatives"])]  # type: ignore[arg-type, call-overload]
     assert {"coulomb"} in sets
@@ -74,7 +78,7 @@ def test_one_cruising_speed_leaves_coulomb_and_viscous_friction_open(tmp_path: P
 @pytest.mark.timeout(400)
 @pytest.mark.usefixtures("without_pictures")
 def test_a_drag_outside_the_library_is_refused_and_described(tmp_path: Path) -> None:
-    status, found = answer("s35", tmp_path)
+    status, found = answer(AXES / "s35", tmp_path)
     assert status == 3
     assert found["effects"] == []
     (term,) = found["symbolic"]  # type: ignore[misc]
@@ -113,5 +117,5 @@ def test_a_small_blind_test(tmp_path: Path) -> None:
 
 def test_the_draw_is_reproducible_and_mixed() -> None:
     drawn = generate(6, 5)
-    assert drawn == generate(6, 5)
+    assert drawn[:3] == generate(3, 5)
     assert {a.kind for a in drawn} == {"null", "single", "multi", "unknown", "confounded"}

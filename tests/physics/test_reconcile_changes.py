@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from math import copysign, pi, sin
 
 import numpy as np
@@ -52,6 +53,7 @@ def swung(t: float) -> tuple[float, float, float, float]:
     return 1.0 + 0.12 * sin(2 * pi * 0.37 * t + 1.0), INERTIA, 0.0, 0.0
 
 
+@cache
 def drive(plant: Plant, seconds: float = 9.0) -> Session:
     """Let the axis follow three swings that share no period, and record it."""
     rng = np.random.default_rng(5)

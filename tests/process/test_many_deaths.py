@@ -52,7 +52,7 @@ def test_some_hundred_deaths_of_clients_leave_nothing(
                 wait_for(lambda: watch.statistics(1)["handles"] == 1, "all handles have ended")
         return [left_of(pid) for pid in (driver, daemon.pid)]
 
-    before, after = die(120), die(120)
+    before, after = die(70), die(70)
     for (descriptors, own), (descriptors_now, own_now) in zip(before, after, strict=True):
         assert descriptors_now == descriptors
-        assert own_now - own < 250, f"{own_now - own} kB more after 120 deaths"
+        assert own_now - own < 150, f"{own_now - own} kB more after 70 deaths"
