@@ -27,7 +27,9 @@ include_patterns = [
     "drivers/README.md",
     "drivers/*/*.md",
 ]
-exclude_patterns = ["docs/site/contents.md"]
+WITHOUT_PAGES = [".*", "build", "daemon", "etc", "examples", "out", "sioms", "tests", "tools"]
+"""Folders that are not walked: the environment alone has some ten thousand files."""
+exclude_patterns = ["docs/site/contents.md", *WITHOUT_PAGES]
 root_doc = "README"
 html_theme = "furo"
 html_title = f"SIOMS {release}"
