@@ -41,8 +41,10 @@ STOP_AGAIN_S = 0.3
 """A stop that has not been answered on its own way goes the other one, too, after so long [s]."""
 BUSY_S = 6.0
 """How long a gateway may take to begin a session, at least [s]: its machine, or this one, may have too much to do."""
-LEAVE_S = 1.0
-"""How long a program that ends waits for the end of a session [s]."""
+LEAVE_S = 10.0
+"""How long a program that ends waits for the end of a session [s]. It takes milliseconds, or a second where the link
+takes nothing; a thread that outlived the interpreter would be cut off in the midst of a library's work.
+"""
 HELLO_AGAIN_S = 0.1
 """How often a greeting is repeated [s]: a transport may not have made our end of the link known yet."""
 

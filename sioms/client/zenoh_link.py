@@ -32,6 +32,8 @@ from .zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint
 
 BLOCKED_US = 1_000_000
 """How long a frame may wait for a connection that takes none before that is given up [us]."""
+OPENED_S = 10.0
+"""How long the end of a program waits for sessions that are being opened [s]; opening one takes no longer."""
 MOST_QUEUED = 64 << 20
 """Bytes that a gateway may send ahead of this session; more ends it."""
 
@@ -62,10 +64,13 @@ class ZenohLink:
         connect = {"endpoints": [endpoint(host, port)], "timeout_ms": int(1e3 * timeout_s), "exit_on_failure": True}
         _users.add(os.getpid())
         try:
-            self._session = zenoh.open(config(folder, "connect", BLOCKED_US, mode="client", connect=connect))
+            self._session = _opening.open(config(folder, "connect", BLOCKED_US, mode="client", connect=connect))
         except zenoh.ZError as error:
             os.close(self._came)
             raise _reason(what, host, port, folder, error) from None
+        except OSError as error:
+            os.close(self._came)
+            raise OSError(error.errno, f"{what}: {error.strerror}") from None
         name = f"{mine.number}/{secrets.token_hex(8)}"
         self._closing, self._waking = threading.Lock(), threading.Lock()
         self._declared: list[Any] = []
@@ -163,6 +168,47 @@ class ZenohLink:
                 self._session.close()  # type: ignore[no-untyped-call]
 
 
+class _Opening:
+    """Sessions that threads are opening: the program's end waits for them, and there are no more after it. A thread
+    that came out of Zenoh into an interpreter that has ended would be cut off in the midst of its work.
+
+    Concurrency: any threads.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._count = 0
+        self._is_over = False
+
+    def open(self, how: zenoh.Config) -> zenoh.Session:
+        """Open a session; raises OSError: ESHUTDOWN, the program ends; and zenoh.ZError."""
+        with self._changed:
+            self._go_on()
+            self._count += 1
+        try:
+            session = zenoh.open(how)
+            if self._is_over:
+                session.close()  # type: ignore[no-untyped-call]
+                self._go_on()
+            return session
+        finally:
+            with self._changed:
+                self._count -= 1
+                self._changed.notify_all()
+
+    def _go_on(self) -> None:
+        if self._is_over:
+            raise OSError(errno.ESHUTDOWN, "the program is ending")
+
+    def end(self) -> None:
+        """Wait until none is being opened."""
+        with self._changed:
+            self._is_over = True
+            self._changed.wait_for(lambda: not self._count, OPENED_S)
+
+
+_opening = _Opening()
+atexit.register(lambda: _opening.end())
 _open: WeakSet[ZenohLink] = WeakSet()
 _users: set[int] = set()
 """Processes that have opened a session of Zenoh: this one, and those that it was forked from."""
@@ -170,6 +216,8 @@ _users: set[int] = set()
 
 def _leave_all() -> None:
     """Leave the links of the parent to it, in a forked child: what ends one would wait for threads of the parent."""
+    global _opening
+    _opening = _Opening()
     for each in list(_open):
         each.leave()
 

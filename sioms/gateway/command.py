@@ -14,6 +14,7 @@ from sioms.arguments import place
 from sioms.client.keys import Folder
 from sioms.client.places import place_of
 from sioms.documents import json_text
+from sioms.ending import leave
 from sioms.protocol.socketpath import socket_path
 
 PLACE, ZENOH_PLACE = "127.0.0.1:5770", "127.0.0.1:5780"
@@ -65,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
     folder = Folder(args.keys)
     if args.command == "serve":
         _serve(args, folder)
-        return 0
+        leave()
     match args.verb:
         case "new":
             pair = folder.new(args.name or getpass.getuser())

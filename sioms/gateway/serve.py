@@ -11,6 +11,7 @@ import select
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack, closing
 from functools import partial
 
 from sioms.client.keys import Folder
@@ -166,7 +167,7 @@ class Serve:
         return self._wall
 
     def run(self) -> None:
-        """Serve until ``end``."""
+        """Serve until ``end``; ``close`` comes after it, whatever it ends by."""
         for each in self.transports:
             each.start()
         manager = ServiceManager()
@@ -198,19 +199,21 @@ class Serve:
                 fed_ns = now_ns
                 manager.tell("WATCHDOG=1")
         manager.tell("STOPPING=1")
-        self.close()
 
     def end(self) -> None:
         """Have the loop end."""
         self._ending = True
 
     def close(self) -> None:
-        """End all sessions, and let go of everything."""
-        for session in list(self.gateway.sessions.values()):
-            self.gateway.end(session, errno.EIO, "the gateway ends")
-        for each in self.transports:
-            each.close()
-        self._epoll.close()
+        """End all sessions, and let go of everything: nothing of a library calls us any more. One part that fails
+        leaves none of the others open.
+        """
+        with ExitStack() as parts:
+            parts.callback(self._epoll.close)
+            for each in self.transports:
+                parts.callback(each.close)
+            for session in list(self.gateway.sessions.values()):
+                parts.callback(self.gateway.end, session, errno.EIO, "the gateway ends")
 
 
 def serve(path: str, folder: Folder, *, zmq: tuple[str, int] | None, zenoh: tuple[str, int] | None) -> None:
@@ -226,15 +229,16 @@ def serve(path: str, folder: Folder, *, zmq: tuple[str, int] | None, zenoh: tupl
     """
     permit_files()
     gateway = Serve(path, folder)
-    if zmq is not None:
-        from .zeromq import ZeroMq
+    with closing(gateway):
+        if zmq is not None:
+            from .zeromq import ZeroMq
 
-        gateway.transports.append(ZeroMq(gateway, path, *zmq, folder))
-    if zenoh is not None:
-        from .zenoh import Zenoh
+            gateway.transports.append(ZeroMq(gateway, path, *zmq, folder))
+        if zenoh is not None:
+            from .zenoh import Zenoh
 
-        gateway.transports.append(Zenoh(gateway, path, *zenoh, folder))
-    on_end(gateway.end)
-    for each in gateway.transports:
-        log("info", "ready", **each.about, keys=folder.path)
-    gateway.run()
+            gateway.transports.append(Zenoh(gateway, path, *zenoh, folder))
+        on_end(gateway.end)
+        for each in gateway.transports:
+            log("info", "ready", **each.about, keys=folder.path)
+        gateway.run()

@@ -67,8 +67,11 @@ class Stops:
 
     def close(self) -> None:
         """End, and let go of everything."""
-        self._told.send(b"")
-        self._thread.join(2.0)
+        if self._thread.ident is None:  # it has not been started: nobody else lets go
+            self._release()
+        else:
+            self._told.send(b"")
+            self._thread.join(2.0)
         self._told.close()
 
     def _run(self) -> None:
@@ -84,6 +87,9 @@ class Stops:
                 self._serve(self._judge)
             if self._quit in ready:
                 break
+        self._release()
+
+    def _release(self) -> None:
         self._ways.close()
         for each in (self._zap, self._sock, self._quit):
             each.close()

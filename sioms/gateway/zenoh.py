@@ -166,8 +166,7 @@ class Zenoh:
                 return  # its next frame is none that follows, and ends its session
             self._waiting[found[1]] += 1
         self._frames.append((found[1], found[2], frame))
-        with suppress(OSError):
-            os.eventfd_write(self._came, 1)
+        os.eventfd_write(self._came, 1)
 
     def _frame(self, sample: zenoh.Sample) -> None:
         self._prompt.enter()
@@ -271,9 +270,10 @@ class Zenoh:
         self._ways.close()
 
     def close(self) -> None:
-        """Let go of everything."""
-        self._stops.close()
-        self._thread.join(2.0)
+        """Let go of everything. Zenoh first: when its session has ended no thread of it is in ours, or comes again."""
         self._session.close()  # type: ignore[no-untyped-call]
+        self._stops.close()
+        if self._thread.ident is not None:
+            self._thread.join(2.0)
         self._loop.remove(self._came)
         os.close(self._came)

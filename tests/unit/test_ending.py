@@ -34,3 +34,18 @@ def test_who_is_told_to_end_has_not_failed(number: signal.Signals) -> None:
 def test_what_serves_has_the_one_way_to_end(name: str) -> None:
     text = (SIOMS / name).read_text()
     assert "from sioms.ending import" in text and "signal.SIGTERM" not in text
+
+
+LEAVES = """
+import atexit, threading, time
+from sioms.ending import leave
+atexit.register(print, "taken apart")
+threading.Thread(target=time.sleep, args=(60,)).start()
+print("said", end="")
+leave(3)
+"""
+
+
+def test_who_leaves_has_written_all_and_runs_nothing_more() -> None:
+    found = subprocess.run([sys.executable, "-c", LEAVES], capture_output=True, text=True, timeout=30.0, check=False)
+    assert found.stdout == "said" and found.returncode == 3
