@@ -154,7 +154,7 @@ class NodeCore(Generic[S]):
     Attributes:
         info: what the node is (GET_IO_STRUCT_INFO).
         name: node name.
-        owed_ns: what took effect before this instant must be in what is read next; 0: nothing is owed.
+        owed_ns: what took effect before this instant must be in what is read next; it only grows.
         clock: of the cell, which both are in, where that is another machine's; None: it is ours.
     """
 
@@ -173,7 +173,7 @@ class NodeCore(Generic[S]):
         self._snapshot: Any = SNAPSHOT[info.node_class]
         self._latest = self._page.latest
         self._subscribed = 0
-        self.owed_ns = 0
+        self.owed_ns = self._shown_ns = 0
         device = self._page.device
         shown.join(self, device)
         channel.acknowledged = lambda instant_ns: shown.acknowledged(device, instant_ns)
@@ -205,12 +205,8 @@ class NodeCore(Generic[S]):
         """
         try:
             raw = self._latest(monotonic_ns())
-            if self.owed_ns:
-                instant_ns = as_of_ns(raw)
-                if instant_ns >= self.owed_ns:
-                    shown.paid(self, instant_ns)
-                else:
-                    raw = self._wait_shown(raw)
+            if self.owed_ns > self._shown_ns and not self._is_paid(raw):
+                raw = self._wait_shown(raw)
         except (NotReadable, ValueError) as error:
             raise self._unreadable(error) from None
         if self._subscribed:
@@ -224,18 +220,17 @@ class NodeCore(Generic[S]):
         Raises:
             OSError: as ``read``.
         """
-        if self.owed_ns:
-            try:
-                self._is_paid(self._latest(monotonic_ns()))
-            except (NotReadable, ValueError) as error:
-                raise self._unreadable(error) from None
-        return not self.owed_ns
+        try:
+            return self.owed_ns <= self._shown_ns or self._is_paid(self._latest(monotonic_ns()))
+        except (NotReadable, ValueError) as error:
+            raise self._unreadable(error) from None
 
     def _is_paid(self, raw: bytes) -> bool:
+        """Whether a snapshot shows all that is owed; later ones do, too, and what is owed up to its instant."""
         instant_ns = as_of_ns(raw)
         if instant_ns < self.owed_ns:
             return False
-        shown.paid(self, instant_ns)
+        self._shown_ns = instant_ns
         return True
 
     def _wait_shown(self, raw: bytes) -> bytes:

@@ -2,8 +2,8 @@
 
 An acknowledgement carries the instant of its effect, a snapshot the instant up to which it shows everything
 (``sioms.protocol.page``). All nodes of a device learn of an acknowledgement that any of them has got, all nodes
-of the process of what the daemon has acknowledged: a stop, a reset, a signal. A node that owes nothing pays
-one comparison for that in ``read``.
+of the process of what the daemon has acknowledged: a stop, a reset, a signal. A node that has shown all it owes pays
+one comparison for that in ``read``; what it owes only grows, so that settling it takes no lock.
 
 Concurrency: any thread.
 """
@@ -95,10 +95,3 @@ def acknowledged_by_daemon(as_of_ns: int, clock: Clock | None = None) -> None:
 def clock_acknowledged(clock: Clock) -> Callable[[int], None]:
     """Return what a session with a cell of another clock tells of what has been acknowledged."""
     return lambda as_of_ns: acknowledged_by_daemon(as_of_ns, clock)
-
-
-def paid(node: Owing, as_of_ns: int) -> None:
-    """Note that a node has a snapshot that shows everything before an instant."""
-    with _lock:
-        if node.owed_ns <= as_of_ns:
-            node.owed_ns = 0
