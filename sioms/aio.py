@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import asyncio
 import errno
-import os
 from contextlib import suppress
 from select import POLLIN, poll
 from time import monotonic
@@ -113,6 +112,11 @@ class _Requests(_Waiter):
             return await future
         except asyncio.CancelledError:
             self._cancel(number, call)
+            if not future.cancelled() and future.exception() is None:  # it came first, and nobody takes it
+                answer = future.result()
+                answer.fds.close()
+                with suppress(OSError):
+                    self._undo(call, 0, answer.value)
             raise
         finally:
             look = self._looks.pop(number, None)
@@ -143,6 +147,16 @@ class _Requests(_Waiter):
             future.set_exception(self._channel.late(call))
             self._cancel(number, call)
 
+    def _undo(self, call: Call | None, refused: int, value: Any) -> None:
+        """Undo what was done before the cancel came, or the answer reached who was cancelled: nobody else will."""
+        if call is None or refused:
+            return
+        if isinstance(call.message, verbs.Open):
+            self._channel.send(Call("close", verbs.Close(value[0])))
+        elif isinstance(call.message, verbs.ReserveMarker):
+            for token in value:
+                self._channel.send(Call("free marker", verbs.FreeMarker(token)))
+
     def _cancel(self, number: int, call: Call) -> None:
         if self._futures.pop(number, None) is not None:
             self._abandoned[number] = call
@@ -167,12 +181,8 @@ class _Requests(_Waiter):
                 message, fds = packet
                 future = self._futures.pop(message[1], None)
                 if future is None or future.done():
-                    for fd in fds:
-                        os.close(fd)
-                    call = self._abandoned.pop(message[1], None)
-                    if call is not None and isinstance(call.message, verbs.Open) and fds:
-                        # Opened just before the cancel arrived: nobody will close it but us.
-                        self._channel.send(Call("close", verbs.Close(message[3][0])))
+                    fds.close()
+                    self._undo(self._abandoned.pop(message[1], None), message[2], message[3])
                     continue
                 try:
                     future.set_result(self._channel.result(packet))

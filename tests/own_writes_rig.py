@@ -177,6 +177,7 @@ class World:
         channel = Channel(_socket.socket(fileno=ours.detach()), info.name, False)
         fd = os.dup(self.page_fds[block])
         node = NodeCore(info, number, LocalPage(fd, readable), list(channels), bit, channel)
+        node._owe()
         self.clients.append(Client(self, node, channel))
         return self.clients[-1]
 

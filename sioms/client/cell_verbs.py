@@ -129,7 +129,7 @@ class WorkcellVerbs(Session[M]):
                     raise
             else:
                 _, self.name, self.rights = answer.value
-                self._request = StopRequest(*answer.fds) if answer.fds else None
+                self._request = StopRequest(*answer.fds.take()) if answer.fds else None
                 return
             await self._waiter.pause(0.02)
 
@@ -184,14 +184,21 @@ class WorkcellVerbs(Session[M]):
         if self._channel.clock is not None:
             lease = 0.0 if core[0].read_only else lease or REMOTE_LEASE_S
         node = self._NODES[core[0].node_class](core, self, self._waiter_of(core[-1]), lease)
-        self._nodes[node.handle] = node
-        self._drivers[node.handle] = core[-1].server
-        if self._channel.clock is not None:
-            self._live_together(node, lease)
         if kind is not None and not isinstance(node, kind):
             node.release()
             await self._closed_handle(node.handle)
             raise OSError(errno.EINVAL, f"open {name}: it is an {type(node).__name__}; want an {kind.__name__}")
+        handle, server = node.handle, core[-1].server
+        try:
+            node._owe()
+            if self._channel.clock is not None:
+                self._live_together(node, lease)
+        except BaseException:  # of a signal: nobody will ever close it
+            node.release()
+            raise
+        # From here on the session keeps it: no call comes behind that, and so no signal that would leave it unknown.
+        self._drivers[handle] = server
+        self._nodes[handle] = node
         return node
 
     def _live_together(self, node: NodeVerbs[Any], lease: float) -> None:
@@ -202,9 +209,10 @@ class WorkcellVerbs(Session[M]):
         if lease:
             self._fellows.append(node._channel)
             self._beat_s = min(self._beat_s or lease, lease / 3)
-        for channel in (self._channel, *[each._channel for each in self._nodes.values()]):
+        nodes = [*self._nodes.values(), node]
+        for channel in (self._channel, *[each._channel for each in nodes]):
             channel.fellows, channel.keepalive_s = self._fellows, self._beat_s
-        for each in self._nodes.values():
+        for each in nodes:
             each._page.every_ns = min(int(self._beat_s * 1e9) or RENEWED_NS, RENEWED_NS)  # type: ignore[attr-defined]
 
     @verb
@@ -258,10 +266,9 @@ class WorkcellVerbs(Session[M]):
         """
         answer = await self._waiter.call(Call(f"open the journal of {device or 'the daemon'}", verbs.Journal(device)))
         if len(answer.fds) < 2:  # the kernel drops what goes beyond the limit of open descriptors
-            for fd in answer.fds:
-                os.close(fd)
             raise OSError(errno.EMFILE, f"open the journal of {device or 'the daemon'}: too many open descriptors")
-        return answer.fds[0], answer.fds[1]
+        first, second = answer.fds.take()
+        return first, second
 
     @verb
     async def report(self, level: str, text: str) -> None:

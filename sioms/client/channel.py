@@ -16,7 +16,7 @@ from struct import pack, unpack
 from time import monotonic
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply, encode, short_reply, value_of
-from sioms.protocol.verbs import Cancel, CancelOnHandle, Keepalive, Part
+from sioms.protocol.verbs import Cancel, CancelOnHandle, FreeMarker, Keepalive, Part, ReserveMarker
 
 from .arguments import checked, seconds
 from .shown import acknowledged_by_daemon
@@ -58,13 +58,14 @@ class Call:
         enough: tells of an overdue answer whether it is not needed any more.
         through: the process that has to act before it can be answered, beside the one that answers; 0: none.
         number: with which it is sent, known before it is; 0: it has not come to that.
+        found: the packet that answers it, and its descriptors; None: there is none yet.
 
     Raises:
         TypeError, ValueError: an argument is none that the verb takes; the other side would take it for a broken
             client.
     """
 
-    __slots__ = ("ahead", "enough", "limit_s", "message", "number", "through", "what")
+    __slots__ = ("ahead", "enough", "found", "limit_s", "message", "number", "through", "what")
 
     def __init__(
         self,
@@ -83,6 +84,7 @@ class Call:
         self.limit_s = seconds(what, limit_s)
         self.enough = enough
         self.number = 0
+        self.found: tuple[list[Any], Descriptors] | None = None
 
     @property
     def first_look_s(self) -> float:
@@ -90,19 +92,40 @@ class Call:
         return FIRST_LOOK_S if self.enough is None else ENOUGH_LOOK_S
 
 
+class Descriptors(list[int]):
+    """Descriptors that came with an answer. Those that nobody takes out are closed, however it comes that nobody does:
+    of a node that has been opened for who is interrupted, its driver sees the end of file.
+    """
+
+    __slots__ = ()
+
+    def take(self) -> list[int]:
+        """Return them; they are the caller's."""
+        taken = list(self)
+        self.clear()
+        return taken
+
+    def close(self) -> None:
+        """Close them."""
+        while self:
+            os.close(self.pop())
+
+    __del__ = close
+
+
 class Answer:
     """A successful reply: its value, and the descriptors that came along."""
 
     __slots__ = ("fds", "value")
 
-    def __init__(self, value: Any, fds: list[int]) -> None:
+    def __init__(self, value: Any, fds: Descriptors) -> None:
         self.value = value
         self.fds = fds
 
 
-def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> list[int]:
+def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> Descriptors:
     # Without the module array: it drags a third of the start time of a shell tool behind it.
-    fds: list[int] = []
+    fds = Descriptors()
     for level, kind, data in ancillary:
         if level == SOL_SOCKET and kind == SCM_RIGHTS:
             fds += memoryview(data[: len(data) - len(data) % 4]).cast("i")
@@ -150,8 +173,8 @@ class Channel:
         self._number = 0
         self._mutex = allocate_lock()
         self._reading = 0
-        self._abandoned: set[int] = set()
-        self._answers: dict[int, tuple[list, list[int]]] = {}  # type: ignore[type-arg]
+        self._abandoned: dict[int, Message | None] = {}
+        self._answers: dict[int, tuple[list, Descriptors]] = {}  # type: ignore[type-arg]
         self._waiting: dict[int, object] = {}
         self._timeout = 0.0
         self.keepalive_s = 0.0
@@ -185,9 +208,13 @@ class Channel:
             self.send(call)
             return self.wait(call.number, call)
         except KeyboardInterrupt:  # also of one that comes when the request has been sent, and before ``send`` returns
-            if call.number:
-                self._abandon(call.number)
+            self.abandon(call)
             raise
+
+    def abandon(self, call: Call) -> None:
+        """Nobody waits for the answer to a request any more, if it has been sent: cancel it, and undo what it did."""
+        if call.number:
+            self._abandon(call.number, call.message, call.found)
 
     def short_call(self, arguments: tuple[Any, ...], call: Callable[[], Call]) -> Any:
         """Send a request and return the value of its answer, in few steps where no thread shares the channel.
@@ -241,7 +268,7 @@ class Channel:
             packet = self._sock.recv(MAX_PACKET, self._flags)
             message = short_reply(packet, number)
             if message is None:
-                self._sort(*self._decoded(packet, []))
+                self._sort(*self._decoded(packet, Descriptors()))
             return message
         except BlockingIOError:
             if self.keepalive_s:
@@ -254,18 +281,33 @@ class Channel:
                 self._reading = 0
                 self._pass_on()
 
-    def _abandon(self, number: int) -> None:
-        """Nobody waits for this answer any more: cancel the request, and let go of what it may bring."""
+    def _abandon(
+        self, number: int, message: Message | None = None, found: tuple[list[Any], Descriptors] | None = None
+    ) -> None:
+        """Cancel a request, and let go of what its answer may bring, or has brought."""
         cancel = Cancel(number) if self._passed else CancelOnHandle(number)
+        cancelled = Call("cancel", cancel)
         try:
-            cancelled = self.send(Call("cancel", cancel))
+            self.send(cancelled)
         except OSError:
             return  # the other side has gone, and the request with it
         with self._mutex:
-            self._abandoned |= {number, cancelled}
-            found = self._answers.pop(number, None)
-        for fd in found[1] if found else ():
-            os.close(fd)
+            self._abandoned |= {number: message, cancelled.number: None}
+            found = found or self._answers.pop(number, None)
+        if found:
+            self._drop(*found)
+
+    def _drop(self, message: list[Any], fds: Descriptors) -> None:
+        """Let go of an answer that nobody waits for; markers that it reserved are free again."""
+        fds.close()
+        if isinstance(self._abandoned.pop(message[1]), ReserveMarker) and not message[2]:
+            for token in message[3]:
+                freeing = Call("free marker", FreeMarker(token))
+                try:
+                    self.send(freeing)
+                except OSError:
+                    return
+                self._abandoned[freeing.number] = None
 
     def send(self, call: Call) -> int:
         """Send a request; return its number."""
@@ -347,8 +389,11 @@ class Channel:
         overdue: Overdue | None = None
         while True:
             with self._mutex:
-                found = self._answers.pop(number, None)
-                if found is None:
+                # A signal may come behind each call, so that nothing is taken before it lies in its place.
+                found = call.found = self._answers.get(number)
+                if found is not None:
+                    del self._answers[number]
+                else:
                     if self._ended is not None:
                         raise OSError(*self._ended)
                     lead = not self._reading
@@ -373,22 +418,20 @@ class Channel:
                     if late and not self._reading:  # the reading may just have been passed to us
                         self._pass_on()
                 if late:
-                    self._abandon(number)
+                    self._abandon(number, call.message)
                     raise self.late(call)
                 continue
             try:
-                found = self._read(number, deadline)
+                is_there = self._read(number, deadline)
             finally:
                 with self._mutex:
                     self._reading = 0
                     self._pass_on()
-            if found is not None:
-                return self.result(found)
-            if deadline is not None:
+            if not is_there and deadline is not None:
                 overdue = overdue or self.overdue(call, due_s)
                 deadline = overdue.until(monotonic())
                 if not deadline:
-                    self._abandon(number)
+                    self._abandon(number, call.message)
                     raise self.late(call)
 
     def _pass_on(self) -> None:
@@ -396,7 +439,7 @@ class Channel:
         for waiting in list(self._waiting)[: None if self._ended else 1]:
             self._waiting.pop(waiting).release()  # type: ignore[attr-defined]
 
-    def take(self) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
+    def take(self) -> tuple[list, Descriptors] | None:  # type: ignore[type-arg]
         """Read one packet without waiting, for event loops; None when there is none.
 
         Raises:
@@ -421,14 +464,14 @@ class Channel:
                 if not self._reading:
                     self._sock.close()
 
-    def _read(self, number: int, deadline: float | None) -> tuple[list, list[int]] | None:  # type: ignore[type-arg]
-        """Read packets until the one with this number has come; None when it is late."""
+    def _read(self, number: int, deadline: float | None) -> bool:
+        """Read packets until the answer with this number has come; return False when it is late."""
         while True:
             timeout = self.keepalive_s or INTERRUPTIBLE_S
             if deadline is not None:
                 timeout = min(timeout, deadline - monotonic())
                 if timeout <= 0:
-                    return None
+                    return False
             self._set_timeout(timeout)
             if self.carrier is not None:
                 self.carrier.wait(timeout)
@@ -438,16 +481,14 @@ class Channel:
                 if self.keepalive_s:
                     self.keepalive()
                 continue
-            if message[1] == number:
-                return message, fds
             self._sort(message, fds)
+            if message[1] == number:
+                return True
 
-    def _sort(self, message: list[Any], fds: list[int]) -> None:
+    def _sort(self, message: list[Any], fds: Descriptors) -> None:
         """Keep an answer for whom it is for."""
         if message[1] in self._abandoned:
-            self._abandoned.discard(message[1])
-            for fd in fds:  # of a node that was opened all the same: its driver sees the end of file
-                os.close(fd)
+            self._drop(message, fds)
             return
         with self._mutex:
             self._answers[message[1]] = (message, fds)
@@ -455,8 +496,8 @@ class Channel:
         if turn is not None:
             turn.release()  # type: ignore[attr-defined]
 
-    def _packet(self, flags: int) -> tuple[list, list[int]]:  # type: ignore[type-arg]
-        fds: list[int] = []
+    def _packet(self, flags: int) -> tuple[list, Descriptors]:  # type: ignore[type-arg]
+        fds = Descriptors()
         try:
             if self._passed:
                 packet, ancillary, _, _ = self._sock.recvmsg(MAX_PACKET, _ANCILLARY, flags | _CMSG_CLOEXEC)
@@ -469,7 +510,7 @@ class Channel:
             raise self._gone(error, "receive") from None
         return self._decoded(packet, fds)
 
-    def _decoded(self, packet: bytes, fds: list[int]) -> tuple[list, list[int]]:  # type: ignore[type-arg]
+    def _decoded(self, packet: bytes, fds: Descriptors) -> tuple[list, Descriptors]:  # type: ignore[type-arg]
         if not packet:
             raise self._gone(None, "receive")
         try:
@@ -491,14 +532,12 @@ class Channel:
             seconds = int(coarse)
             self._sock.setsockopt(SOL_SOCKET, SO_RCVTIMEO, pack("ll", seconds, int((coarse - seconds) * 1e6)))
 
-    def result(self, found: tuple[list, list[int]]) -> Answer:  # type: ignore[type-arg]
+    def result(self, found: tuple[list, Descriptors]) -> Answer:  # type: ignore[type-arg]
         """Turn a packet into an answer, or raise its refusal."""
         message, fds = found
         if message[5]:
             self.acknowledged(message[5])
         if message[2]:
-            for fd in fds:
-                os.close(fd)
             raise OSError(message[2], message[3])
         try:
             return Answer(value_of(message), fds)
@@ -524,7 +563,7 @@ class Channel:
                     message = decode_reply(packet)
                     if message[1] == 0:
                         return message[2], str(message[3])
-                    self._answers[message[1]] = (message, [])
+                    self._answers[message[1]] = (message, Descriptors())
             except (OSError, MalformedMessage):
                 continue
         return None

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Self
 
 from .cell_verbs import WorkcellVerbs
@@ -29,6 +31,14 @@ class _Together:
         self._threads: ThreadPoolExecutor | None = None
 
     async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+        try:
+            return self._calls(calls)
+        except BaseException:  # of a signal, at whichever cell it comes: nobody waits for the others any more
+            for cell, call in calls:
+                cell._channel.abandon(call)
+            raise
+
+    def _calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
         carriers = [carrier for cell, _ in calls if (carrier := cell._channel.carrier) is not None]
         if len(carriers) < 2:
             return self._answers(calls, self._send(calls))
@@ -64,8 +74,19 @@ class _Together:
     async def all(self, steps: Sequence[Coroutine[Any, Any, Any]]) -> list[Any]:
         if self._threads is None:
             self._threads = ThreadPoolExecutor(THREADS, "fleet")
-        tasks = [self._threads.submit(run, step) for step in steps]
-        return [task.exception() or task.result() for task in tasks]
+        tasks = []
+        try:
+            for step in steps:
+                tasks.append(self._threads.submit(run, step))
+            return [task.exception() or task.result() for task in tasks]
+        except BaseException:  # of a signal: what has not begun does not begin
+            for task, step in zip_longest(tasks, steps):
+                if task is None or task.cancel():
+                    with suppress(ValueError):  # it has begun all the same
+                        step.close()
+                else:
+                    task.add_done_callback(_let_go)
+            raise
 
     async def connect(self, address: str, name: str) -> Workcell:
         return Workcell(address, name or None)
@@ -73,6 +94,12 @@ class _Together:
     def close(self) -> None:
         if self._threads is not None:
             self._threads.shutdown(wait=False, cancel_futures=True)
+
+
+def _let_go(task: Future[Any]) -> None:
+    """Close a session that comes when nobody waits for it any more."""
+    if not task.cancelled() and not task.exception() and isinstance(cell := task.result(), Workcell):
+        cell.close()
 
 
 class FleetMarker(Blocking, FleetMarkerVerbs):

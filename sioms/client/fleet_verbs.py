@@ -103,7 +103,11 @@ class FleetMarkerVerbs:
         deadline = None if timeout is None else monotonic() + as_number("wait for marker: timeout", timeout, "seconds")
         failed: dict[str, OSError] = {}
         steps = [self._wait_in(name, marker, deadline, failed) for name, marker in self._markers.items()]
-        found = [at for at in await self._fleet._together.all(steps) if isinstance(at, int)]
+        try:
+            found = [at for at in await self._fleet._together.all(steps) if isinstance(at, int)]
+        except BaseException:  # interrupted, or cancelled: those that still wait look at this
+            failed[""] = OSError(errno.ECANCELED, "cancelled")
+            raise
         if found:
             return min(found)
         raise FleetError("wait for marker", failed, len(self._markers))
@@ -202,6 +206,7 @@ class FleetVerbs(Generic[C]):
         message: Callable[[str], verbs.Message],
         names: Sequence[str] | None = None,
         leave: bool = False,
+        undo: Callable[[Any], verbs.Message] | None = None,
     ) -> dict[str, Any]:
         """Ask several cells at once; return the value of each answer.
 
@@ -210,14 +215,18 @@ class FleetVerbs(Generic[C]):
             message: makes that of a cell.
             names: of the cells, None = all.
             leave: whether to leave those out that fail, instead of an error.
+            undo: makes what undoes it, of the value of its answer, for those that did it when others failed.
         """
         names = list(self.cells) if names is None else names
         calls = [(self.cells[name], Call(what, message(name))) for name in names]
         answers = dict(zip(names, await self._together.calls(calls), strict=True))
         errors = {name: answer for name, answer in answers.items() if isinstance(answer, OSError)}
+        values = {name: answer.value for name, answer in answers.items() if not isinstance(answer, OSError)}
         if errors and not leave:
+            if undo is not None:
+                await self._together.calls([(self.cells[name], Call(what, undo(values[name]))) for name in values])
             raise FleetError(what, errors, len(names))
-        return {name: answer.value for name, answer in answers.items() if not isinstance(answer, OSError)}
+        return values
 
     @verb
     async def close(self) -> None:
@@ -285,7 +294,11 @@ class FleetVerbs(Generic[C]):
             call = Call("emergency stop", verbs.EmergencyStop("", why))
             call.enough = request_stop(cell._request, why)
             calls.append((cell, call))
-        answers = await self._together.calls(calls)
+        try:
+            answers = await self._together.calls(calls)
+        except BaseException:  # interrupted, or cancelled: all hear of it before this ends
+            self._stop_unasked(why)
+            raise
         errors = dict(self.missing)
         for name, (_, call), answer in zip(self.cells, calls, answers, strict=True):
             if isinstance(answer, OSError) and not (call.enough and call.enough()):
@@ -298,6 +311,16 @@ class FleetVerbs(Generic[C]):
                 del errors[name]
         if errors:
             raise FleetError("emergency stop", errors, len(self.cells) + len(self.missing))
+
+    def _stop_unasked(self, why: str) -> None:
+        """Tell all cells to stop, without waiting for their answers; a second time does no harm."""
+        for cell in self.cells.values():
+            call = Call("emergency stop", verbs.EmergencyStop("", why))
+            try:
+                cell._channel.send(call)
+            except OSError:
+                continue
+            cell._channel.abandon(call)
 
     async def _stop_again(self, name: str, why: str) -> None:
         cell = await self._together.connect(self._addresses[name], self._name)
@@ -322,7 +345,9 @@ class FleetVerbs(Generic[C]):
     @verb
     async def reserve_marker(self) -> Any:
         """Reserve a marker in every cell; returns a FleetMarker. They are freed with the sessions."""
-        tokens = await self._ask("reserve a marker", lambda _: verbs.ReserveMarker(1, False))
+        tokens = await self._ask(
+            "reserve a marker", lambda _: verbs.ReserveMarker(1, False), undo=lambda made: verbs.FreeMarker(made[0])
+        )
         markers = {name: self.cells[name]._MARKER(self.cells[name], token) for name, (token,) in tokens.items()}
         return self._MARKER(self, markers)
 
@@ -357,11 +382,18 @@ class FleetVerbs(Generic[C]):
             NodeVerbs._ask(node, Request.SEND_EXTERNAL_SYNCH, there[name])
             for node, name in zip(nodes, names, strict=True)
         ]
-        answers = await self._together.all(told)
+        try:
+            answers = await self._together.all(told)
+        except BaseException:  # interrupted, or cancelled, when some may have been told and others not
+            await self._stop_all(nodes)
+            raise
         if errors := [answer for answer in answers if isinstance(answer, BaseException)]:
-            await self._together.all([NodeVerbs._ask(node, Request.STOP) for node in nodes])
+            await self._stop_all(nodes)
             raise errors[0]
         return start_ns
+
+    async def _stop_all(self, nodes: Sequence[AxisVerbs]) -> None:
+        await self._together.all([NodeVerbs._ask(node, Request.STOP) for node in nodes])
 
     def _clock(self, name: str) -> Clock:
         clock = self.cells[name]._channel.clock

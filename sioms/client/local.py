@@ -10,7 +10,7 @@ from mmap import PROT_READ, mmap
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.page import PageReader
 
-from .channel import Channel
+from .channel import Channel, Descriptors
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ class LeasedPage(LocalPage):
 
 
 def node_parts(
-    value: Any, fds: list[int], clock: Clock | None = None, carrier: Carrier | None = None
+    value: Any, fds: Descriptors, clock: Clock | None = None, carrier: Carrier | None = None
 ) -> tuple[Any, ...]:
     """Turn the answer to an open into the arguments of a node.
 
@@ -107,14 +107,13 @@ def node_parts(
     handle, packed, channels, bit, behind = value
     info = NodeInfo(packed)
     if len(fds) < 3:  # the kernel drops what goes beyond the limit; its driver sees that nobody has it
-        for fd in fds:
-            os.close(fd)
         raise OSError(errno.EMFILE, f"open {info.name}: too many open files in this process; close some")
-    sock = socket(fileno=fds[2])
+    # In one step: a signal that came between two would leave a descriptor that nobody knows, and with it the node open.
+    sock = next(map(socket, (-1,), (-1,), (-1,), iter(fds.pop, None)))
     carried = None if carrier is None else carrier.of(handle, sock)
     channel = Channel(sock, f"node {info.name}", False, behind=behind, clock=clock, carrier=carried)
     if clock is None:
-        return info, handle, LocalPage(fds[0], fds[1]), list(channels), bit, channel
+        return info, handle, LocalPage(*fds.take()), list(channels), bit, channel
 
     def renew() -> None:
         try:
@@ -123,5 +122,6 @@ def node_parts(
         except OSError:
             return  # its next request says what has happened
 
-    page = LeasedPage(fds[0], fds[1], renew)
+    page_fd, wake_fd = fds.take()
+    page = LeasedPage(page_fd, wake_fd, renew)
     return info, handle, page, list(channels), bit, channel

@@ -175,8 +175,11 @@ class NodeCore(Generic[S]):
         self._subscribed = 0
         self.owed_ns = self._shown_ns = 0
         device = self._page.device
-        shown.join(self, device)
         channel.acknowledged = lambda instant_ns: shown.acknowledged(device, instant_ns)
+
+    def _owe(self) -> None:
+        """Owe what has been acknowledged so far, and from now on, until it is released."""
+        shown.join(self, self._page.device)
 
     @property
     def readings(self) -> Readings:

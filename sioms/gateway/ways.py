@@ -44,7 +44,7 @@ class Way:
         try:
             self._channel.call(Call("represent", verbs.Represent(who.name, host, list(who.groups))))
             answer = self._channel.call(Call("hello", verbs.Hello(PROTOCOL_VERSION, "stop")))
-            self._request = StopRequest(*answer.fds) if answer.fds else None
+            self._request = StopRequest(*answer.fds.take()) if answer.fds else None
         except BaseException:
             self.close()
             raise

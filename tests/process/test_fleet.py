@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import signal
 import threading
 import time
 from collections.abc import Iterator
@@ -11,11 +12,13 @@ from pathlib import Path
 
 import pytest
 from daemon_rig import axes, daemons, raises, wait_for
+from interrupt_rig import interrupted_everywhere
 
 import sioms
 import sioms.aio
 from sioms.check.remote import Gateway, Relay, ZenohGateway
 from sioms.children import Process
+from sioms.client.fleet_verbs import SLICE_S
 from sioms.tools.front import main
 
 
@@ -141,6 +144,79 @@ def test_cells_start_at_one_instant_or_not_at_all(fleet: sioms.Fleet) -> None:
     finally:
         for node in nodes:
             node.close()
+
+
+BETWEEN_CELLS = ("sioms.client.fleet", "sioms.client.channel")
+
+
+READING = ("_read", "_packet", "_decoded", "_fds_of", "_last_word")
+"""An answer that a signal takes out of the hand that has just read it is lost; markers end with the session."""
+
+
+def _markers(cells: dict[str, str], watch: dict[str, sioms.Workcell]) -> int:
+    """Return how many markers the sessions of all cells have."""
+    return sum(row[3] for cell in watch.values() for row in cell.status()["sessions"])
+
+
+def test_an_interrupt_between_cells_leaves_nothing_behind(fleet: sioms.Fleet, cells: dict[str, str]) -> None:
+    watch = {name: sioms.Workcell(address, "watch") for name, address in cells.items()}
+    try:
+        before, places = _markers(cells, watch), 0
+        for at in interrupted_everywhere(fleet.reserve_marker, BETWEEN_CELLS, READING, step=7):
+            fleet.status()  # who reads next finds what nobody waits for
+            wait_for(lambda: _markers(cells, watch) == before, f"no marker left of place {at}", 2.0)
+            places = at
+        assert places > 20
+    finally:
+        for cell in watch.values():
+            cell.close()
+
+
+def test_a_stop_that_is_interrupted_reaches_all_cells(fleet: sioms.Fleet) -> None:
+    places = 0
+    for at in interrupted_everywhere(lambda: fleet.emergency_stop("enough"), ("sioms.client.fleet",), step=2):
+        wait_for(lambda: all(s["stopped_ns"] for s in fleet.status().values()), f"all to stop at place {at}", 2.0)
+        fleet.reset()
+        places = at
+    assert places > 5
+    fleet.reset()
+
+
+def test_a_start_that_is_interrupted_starts_nothing(fleet: sioms.Fleet) -> None:
+    nodes = [fleet.open(f"{name}:mod0", "rw", lease=5.0) for name in fleet]
+    try:
+        places = 0
+
+        def start() -> None:
+            for node in nodes:
+                node.command(position=node.read().position[0] + 0.01, synch=True, replace=True)
+            fleet.synch(*nodes, lead=0.1, within=0.1)
+
+        for at in interrupted_everywhere(start, ("sioms.client.fleet",), step=3):
+            until = time.monotonic() + 0.15
+            while time.monotonic() < until:
+                assert not any(node.read().in_motion[0] for node in nodes), f"place {at}"
+            places = at
+        assert places > 3
+    finally:
+        for node in nodes:
+            node.close()
+
+
+def test_a_wait_that_is_interrupted_ends_in_all_cells(fleet: sioms.Fleet) -> None:
+    marker = fleet.reserve_marker()
+    main_thread = threading.main_thread().ident
+    assert main_thread is not None
+    threading.Timer(0.2, signal.pthread_kill, [main_thread, signal.SIGINT]).start()
+    with pytest.raises(KeyboardInterrupt):
+        marker.wait()
+    wait_for(lambda: not any(row[2] for row in _sessions(fleet)), "no wait of ours to be left", 3.0)
+    time.sleep(SLICE_S)
+    assert not any(row[2] for row in _sessions(fleet)), "and none begins"
+
+
+def _sessions(fleet: sioms.Fleet) -> list[list[object]]:
+    return [row for status in fleet.status().values() for row in status["sessions"] if "tester" in str(row[0])]
 
 
 def test_the_asyncio_face(cells: dict[str, str]) -> None:

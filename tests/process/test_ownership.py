@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 from daemon_rig import WORKCELL, Client, Daemon, at_rest, raises, wait_for
+from interrupt_rig import interrupted_everywhere
 
 import sioms
 import sioms.aio
@@ -113,6 +114,42 @@ def test_a_waiting_open_can_be_cancelled(daemon: Daemon, cell: sioms.Workcell) -
     with cell.open("mod0", "rw"):
         asyncio.run(story())
     cell.open("mod0", "rw", timeout=1.0).close()
+
+
+def test_an_open_that_is_cancelled_when_its_answer_has_come_leaves_nothing_open(daemon: Daemon) -> None:
+    """The answer is there, and who asked for it is cancelled before the loop has come to it."""
+    asked = {1: lambda other: other.open("mod0", "rw"), 3: lambda other: other.reserve_marker()}
+
+    async def story() -> None:
+        async with await sioms.aio.connect(daemon.socket) as other:
+            before = len(os.listdir("/proc/self/fd"))
+            for ask in asked.values():
+                task = asyncio.create_task(ask(other))
+                await asyncio.sleep(0)
+                requests = other._waiter
+                while requests._futures:
+                    requests._readable()
+                task.cancel()
+                with pytest.raises(asyncio.CancelledError):
+                    await task
+            await asyncio.sleep(0.05)
+            (mine,) = [s for s in (await other.status())["sessions"] if str(os.getpid()) in str(s[0])]
+            assert [mine[row] for row in asked] == [0, 0], "no handle, no marker"
+            assert len(os.listdir("/proc/self/fd")) == before
+
+    asyncio.run(story())
+
+
+def test_an_open_that_is_interrupted_leaves_nothing_open(daemon: Daemon, cell: sioms.Workcell) -> None:
+    modules = ("sioms.client.channel", "sioms.client.local", "sioms.client.cell_verbs")
+    reading = ("_read", "_packet", "_decoded", "_fds_of")
+    with daemon.cell("interrupted") as mine:
+        places = 0
+        for at in interrupted_everywhere(lambda: mine.open("mod0", "rw"), modules, reading, step=3):
+            mine.status()
+            cell.open("mod0", "rw", timeout=1.0).close()
+            places = at
+        assert places > 30
 
 
 def test_race_of_second_writers_has_one_winner(daemon: Daemon) -> None:

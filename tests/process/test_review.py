@@ -28,7 +28,7 @@ from sioms.protocol.verbs import Hello, Write
 
 def test_the_stop_request_file_cannot_be_taken_away(daemon: Daemon, cell: sioms.Workcell) -> None:
     channel = Channel(connect(daemon.socket), "the daemon")
-    fd, taken = channel.call(Call("hello", Hello(PROTOCOL_VERSION, "rogue"))).fds
+    fd, taken = channel.call(Call("hello", Hello(PROTOCOL_VERSION, "rogue"))).fds.take()
     try:
         with pytest.raises(OSError):
             os.pwrite(taken, bytes(8), 0)  # what drivers say is theirs to say

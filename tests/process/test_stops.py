@@ -194,8 +194,7 @@ def test_a_read_only_page_is_sealed(cell: sioms.Workcell) -> None:
         with pytest.raises(PermissionError):
             fcntl.fcntl(page, fcntl.F_ADD_SEALS, 0x2)
     finally:
-        for fd in answer.fds:
-            os.close(fd)
+        answer.fds.close()
 
 
 def test_input_configured_as_stop_source(start_daemon: Callable[..., Daemon]) -> None:

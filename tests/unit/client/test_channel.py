@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import _socket
 import contextlib
-import dis
 import errno
 import os
 import socket
-import sys
 import threading
 import time
 from _thread import allocate_lock
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import FrameType
 
 import pytest
+from interrupt_rig import interrupted_everywhere
 
 from sioms.client.channel import KEEPALIVE, Call, Channel
 from sioms.client.connecting import connect
@@ -359,27 +357,6 @@ def test_the_time_out_of_the_socket_is_set_once_for_all_writes(peer: Peer, monke
     assert set(timeouts) == {1.0}
 
 
-class Interrupt:
-    """Raises KeyboardInterrupt behind the n-th call, or entry, in the channel: there Python heeds signals."""
-
-    def __init__(self, at: int) -> None:
-        self.left = at
-        self.last: dict[FrameType, int] = {}
-
-    def __call__(self, frame: FrameType, event: str, argument: object) -> Interrupt | None:
-        if frame.f_globals.get("__name__") != "sioms.client.channel":
-            return None
-        frame.f_trace_opcodes = True
-        if event == "opcode":
-            before = self.last.get(frame, -1)
-            self.last[frame] = frame.f_lasti
-            if before >= 0 and dis.opname[frame.f_code.co_code[before]] in ("CALL", "CALL_FUNCTION_EX", "RESUME"):
-                self.left -= 1
-                if self.left == 0:
-                    raise KeyboardInterrupt
-        return self
-
-
 class Late:
     """Answers requests, all but those that are cancelled, a moment after they have come."""
 
@@ -416,17 +393,24 @@ def test_an_interrupt_between_any_two_steps_leaves_nothing_behind(peer: Peer, *,
     call = lambda: Call("write", Write(1, 5.0, b"data"), limit_s=5.0)  # noqa: E731 - a new one for each request
     late = Late(peer)
     assert peer.channel.call(call()).value == "late"
-    at, interrupted, tracing = 0, True, sys.gettrace()
-    while interrupted:
-        at += 1
-        interrupted, before = False, len(late.asked)
-        sys.settrace(Interrupt(at))
-        try:
-            peer.channel.short_call((1, 1, 5.0, b"data"), call) if short else peer.channel.call(call())
-        except KeyboardInterrupt:
-            interrupted = True
-        finally:
-            sys.settrace(tracing)
+    before, places = 1, 0
+
+    def ask() -> None:
+        peer.channel.short_call((1, 1, 5.0, b"data"), call) if short else peer.channel.call(call())
+
+    for at in interrupted_everywhere(ask, ("sioms.client.channel",)):
         assert peer.channel.call(call()).value == "late", f"interrupted at place {at}"
         assert set(late.asked[before:-1]) <= late.cancelled | late.told, f"interrupted at place {at}"
-    assert at > 10 and late.cancelled
+        before, places = len(late.asked), at
+    assert places > 10 and late.cancelled
+
+
+def test_descriptors_that_nobody_takes_are_closed(peer: Peer) -> None:
+    """However it comes that nobody does: a node that was opened for who is interrupted is free again."""
+    asked = peer.ask("open")
+    ours, theirs = os.pipe()
+    socket.send_fds(peer.sock, [reply(asked, "opened")], [theirs])
+    os.close(theirs)
+    peer.join()
+    assert os.read(ours, 1) == b"", "the end of file: nobody has the other end any more"
+    os.close(ours)
