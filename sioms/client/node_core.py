@@ -208,8 +208,13 @@ class NodeCore(Generic[S]):
         """
         try:
             raw = self._latest(monotonic_ns())
-            if self.owed_ns > self._shown_ns and not self._is_paid(raw):
-                raw = self._wait_shown(raw)
+            if self.owed_ns > self._shown_ns:
+                # As _is_paid does, in fewer steps: a loop that reads behind each write finds their code in no cache.
+                instant_ns = int.from_bytes(raw[24:32], "little")
+                if instant_ns >= self.owed_ns:
+                    self._shown_ns = instant_ns
+                else:
+                    raw = self._wait_shown(raw)
         except (NotReadable, ValueError) as error:
             raise self._unreadable(error) from None
         if self._subscribed:

@@ -4,11 +4,9 @@ in C."""
 from __future__ import annotations
 
 import ctypes
-import fcntl
 import os
 import select
 import socket
-import termios
 import time
 
 from .language import Bytes, Context, Integers, record_of
@@ -195,6 +193,9 @@ def send_packet(sock: int, packet: Bytes, size: int) -> int:
 
 def unread(sock: int) -> int:
     """Return how much memory is taken by what has been sent on a socket and its other end has yet to read [bytes]."""
+    import fcntl  # not where steps are compiled: every driver would load them at its start
+    import termios
+
     try:
         return int.from_bytes(fcntl.ioctl(sock, termios.TIOCOUTQ, bytes(4)), "little")
     except OSError:
