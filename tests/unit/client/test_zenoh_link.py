@@ -68,3 +68,23 @@ def test_sessions_are_opened_side_by_side(slow: SimpleNamespace) -> None:
         thread.join(20.0)
     opening.end()
     assert len(opened) == 3 and not slow.closed
+
+
+def test_a_link_takes_back_what_it_has_declared_before_its_session_ends() -> None:
+    said: list[str] = []
+
+    def part(name: str) -> Any:
+        def undeclare() -> None:
+            said.append(name)
+            if name == "token":
+                raise zenoh_link.zenoh.ZError("the connection has ended")
+
+        return SimpleNamespace(undeclare=undeclare)
+
+    ended: Any = zenoh_link.ZenohLink.__new__(zenoh_link.ZenohLink)
+    ended._closing = threading.Lock()
+    ended._declared = [part(name) for name in ("subscriber", "token", "publisher")]
+    ended._session = SimpleNamespace(is_closed=lambda: "session" in said, close=lambda: said.append("session"))
+    ended._end()
+    ended._end()
+    assert said == ["subscriber", "token", "publisher", "session"]
