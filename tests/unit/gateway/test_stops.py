@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import zmq
 
+from sioms.client.channel import Descriptors
 from sioms.gateway import ways, zenoh
 from sioms.gateway.inflow import Inflow
 from sioms.gateway.parts import Principal
@@ -90,8 +91,8 @@ def request_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StopRequest
         (tmp_path / name).write_bytes(bytes(8))
 
     def call(_: object, call: Any) -> Any:
-        fds = [os.open(tmp_path / name, os.O_RDWR) for name in ("stop", "stopped")]
-        return SimpleNamespace(fds=fds if call.what == "hello" else [])
+        names = ("stop", "stopped") if call.what == "hello" else ()
+        return SimpleNamespace(fds=Descriptors(os.open(tmp_path / name, os.O_RDWR) for name in names))
 
     monkeypatch.setattr(ways, "connect", lambda _: None)
     monkeypatch.setattr(ways, "Channel", type("Channel", (), {"__init__": lambda *_: None, "call": call,
