@@ -66,6 +66,7 @@ BENCHES: dict[str, tuple[str, str]] = {
         "killing",
         "processes killed and stopped at random points, alone and together: --trials N kills",
     ),
+    "flat": ("flat", "memory and descriptors of daemon, fork server and driver over --trials N deaths of clients"),
     "compounds": (
         "compounds",
         "the same round a device made of devices: its client, its driver, what it holds: --trials N rounds",

@@ -25,6 +25,7 @@ from sioms.client.command import command
 from sioms.protocol.flags import Request
 
 from .figures import Bar, Report
+from .observer import Observer, Seen
 from .options import Options
 from .watching import HISTORY, Watch
 from .workcells import axes, workcell
@@ -37,6 +38,8 @@ DAEMON_LEASE_S = 0.5
 ROUNDS = 25
 """Rounds that one daemon lives at most; then it is killed, or stopped, itself."""
 BAR_MS = 20.0
+OURS_MS = 10.0
+"""How much later than an observer in the class of its driver hears of the death an axis may halt; else it is we."""
 LIMITS = {"client stopped": LEASE_S * 1e3 + BAR_MS, "daemon stopped": DAEMON_LEASE_S * 1e3 + BAR_MS}
 """How soon an axis halts [ms], by what has happened; BAR_MS after all others."""
 KINDS: Mapping[str, int] = {
@@ -67,6 +70,8 @@ class Tally:
         signals: how many of each were sent to a process that lived.
         kinds: how many rounds and ends of each kind there were.
         halts: by what had happened: from the signal to the axis halting [ns].
+        heard: from the same signals to an observer hearing of the death [ns].
+        late: of each late halt, how much later than the observer it was [ns].
         wrong: what must not be, by name, and how often it was.
     """
 
@@ -74,6 +79,8 @@ class Tally:
         self.signals: Counter[int] = Counter()
         self.kinds: Counter[str] = Counter()
         self.halts: dict[str, list[int]] = {}
+        self.heard: list[int] = []
+        self.late: list[int] = []
         self.wrong = Counter(dict.fromkeys(WRONG, 0))
         self.notes: list[str] = []
 
@@ -101,6 +108,11 @@ def _tell(tally: Tally, report: Report) -> None:
         late = sum(halt > LIMITS.get(what, BAR_MS) * 1e6 for halt in halts)
         report.samples(f"{what} to its axis halting", halts, "ms", bars=[Bar("max", LIMITS.get(what, BAR_MS))],
                        notes=f"{late} later than that")  # fmt: skip
+    if tally.heard:
+        report.samples("client killed to an observer hearing of it", tally.heard, "ms", notes="what the machine takes")
+        ours = sum(late > OURS_MS * 1e6 for late in tally.late)
+        report.value(f"late halts, {OURS_MS:g} ms and more behind the observer", ours, bars=[Bar("value", 0)],
+                     notes=f"of {len(tally.late)}; worst {max(tally.late, default=0) / 1e6:.1f} ms")  # fmt: skip
     for what in WRONG:
         report.value(what, tally.wrong[what], bars=[Bar("value", 0)])
 
@@ -114,11 +126,12 @@ def _life(chance: random.Random, tally: Tally, progress: Callable[[], None]) -> 
     with Daemon(workcell(devices, daemon_lease_s=DAEMON_LEASE_S)) as daemon:
         try:
             before = _weight(daemon)
-            for _ in range(ROUNDS):
-                kind = chance.choices(list(KINDS), list(KINDS.values()))[0]
-                tally.kinds[kind] += 1
-                _round(daemon, kind, chance, tally)
-                progress()
+            with contextlib.closing(Observer(daemon)) as observer:
+                for _ in range(ROUNDS):
+                    kind = chance.choices(list(KINDS), list(KINDS.values()))[0]
+                    tally.kinds[kind] += 1
+                    _round(daemon, observer, kind, chance, tally)
+                    progress()
             _look_for_leaks(daemon, before, tally)
             _end(daemon, chance, tally)
             progress()
@@ -126,7 +139,7 @@ def _life(chance: random.Random, tally: Tally, progress: Callable[[], None]) -> 
             tally.is_wrong("lives that ended in an error", f"{error}; the log ends: {daemon.log()[-600:]}")
 
 
-def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> None:
+def _round(daemon: Daemon, observer: Observer, kind: str, chance: random.Random, tally: Tally) -> None:
     """Have clients on all axes, kill and stop as the kind says, and look."""
     stops = kind.endswith("clients stopped")
     with daemon.cell("judge") as cell:
@@ -144,13 +157,16 @@ def _round(daemon: Daemon, kind: str, chance: random.Random, tally: Tally) -> No
         acts = [(clients[axis], signal.SIGSTOP if stops else signal.SIGKILL, axis) for axis in victims]
         acts += [(pids[name], driver_signal, "") for name in drivers] + [(pid, signal.SIGKILL, "") for pid in servers]
         chance.shuffle(acts)
+        observer.watch([clients[axis] for axis in victims], pids[DEVICES[0]])
         begins = send([(pid, how) for pid, how, _ in acts], chance, tally)
         begin_of = {axis: begin for (_, _, axis), begin in zip(acts, begins, strict=True)}
+        halts: dict[str, int] = {}
         for axis in victims:
             device, _, number = axis.partition(".a")
             if device not in drivers and device != stopped:
                 what = "client stopped" if stops else "client killed"
-                _take_halt(watches[device], int(number), begin_of[axis], what, pids[device], tally)
+                halts[axis] = _take_halt(watches[device], int(number), begin_of[axis], what, pids[device], tally)
+        _compare(observer.seen(), halts, {axis: (clients[axis], begin_of[axis]) for axis in halts}, tally, stops)
         for pid in clients.values():
             daemon.kill(pid)
             daemon.reap(pid)
@@ -226,17 +242,38 @@ def _marked(cell: Any) -> None:
     marker.free()
 
 
-def _take_halt(watch: Watch, axis: int, begin: int, what: str, pid: int, tally: Tally) -> None:
-    """Take how long an axis took from a signal to its first slower snapshot."""
+def _take_halt(watch: Watch, axis: int, begin: int, what: str, pid: int, tally: Tally) -> int:
+    """Take how long an axis took from a signal to its first slower snapshot; return that [ns], 0 when it did not."""
     try:
         snapshot = watch.first(lambda s: abs(s.commanded_velocity[axis]) < SPEED - 1e-6, begin, 5.0, "an axis halting")
     except (TimeoutError, OSError) as error:
         tally.is_wrong("axes that never halted", f"{what}: {error}")
-        return
+        return 0
     halt = int(snapshot.stamp_ns) - begin
     tally.halts.setdefault(what, []).append(halt)
     if halt > LIMITS.get(what, BAR_MS) * 1e6:
         tally.notes.append(f"{what}: {halt / 1e6:.0f} ms; {_circumstances(pid)}")
+    return halt
+
+
+def _compare(
+    seen: Seen, halts: Mapping[str, int], of: Mapping[str, tuple[int, int]], tally: Tally, stops: bool
+) -> None:
+    """Compare what drivers took for the deaths of clients with what an observer took."""
+    if stops:
+        return  # a client that is stopped does not end: it is its lease that does
+    for axis, halt in halts.items():
+        pid, begin = of[axis]
+        if not halt or pid not in seen.ended_ns:
+            continue
+        heard = seen.ended_ns[pid] - begin
+        tally.heard.append(heard)
+        if halt > BAR_MS * 1e6:
+            tally.late.append(halt - heard)
+            tally.notes.append(
+                f"{axis} halted after {halt / 1e6:.1f} ms; an observer heard of it after {heard / 1e6:.1f}, and "
+                f"woke up to {seen.late_ns / 1e6:.1f} ms late"
+            )
 
 
 def _circumstances(pid: int) -> str:
