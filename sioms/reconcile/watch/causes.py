@@ -138,7 +138,7 @@ def judge(normal: Normal, now: Estimate, travel: float) -> Finding:
     slack = cover.copy()
     at = np.arange(SIZE)
     slack[at, at] += (BENT * bent / np.maximum(normal.per, 1e-300)) ** 2
-    places = np.abs(change[[PLACE, PLAY]]).max() if cover[PLACE, PLACE] < UNKNOWN / 2 else 0.0
+    places = float(np.abs(change[[PLACE, PLAY]]).max())
     slack[[PLACE, PLAY], [PLACE, PLAY]] += (BENT * places) ** 2
     slack[SCALE, SCALE] += (BENT * places / travel) ** 2
     loose = {cause.name: _fit(cause, normal.theta, change, slack) for cause in CAUSES}

@@ -42,8 +42,9 @@ MODEL_SHARE = 0.002
 FRICTIONS = (VISCOUS, DRY, CONSTANT)
 #: A variance beyond all: the number is not known.
 UNKNOWN = 1e12
-#: What place and play of a reference, of the travel, and its scale may be at most (one standard deviation).
-MOST_PLACE, MOST_SCALE = 0.1, 0.1
+#: What place and play of a reference, of the travel, and its scale may be at most (one standard deviation): a pulley or
+#: an encoder that is a quarter off does not get into production.
+MOST_PLACE, MOST_SCALE = 0.1, 0.05
 #: Crossings within this share of the travel are of one edge.
 ONE_EDGE = 0.01
 
@@ -81,8 +82,9 @@ class Normal:
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Numbers of some blocks and their covariance, without the axis's own variation; what is not known has UNKNOWN.
+    """Numbers of some blocks and their covariance, without the axis's own variation.
 
+    A number that no move tells has UNKNOWN, one of the reference that no crossing tells the most that it may be.
     ``left`` is the mean square of force that the model leaves; ``gram`` and ``rows`` are of the blocks.
     """
 
@@ -159,18 +161,27 @@ def _refer(
 
     One edge tells the place and so much times the scale together, crossings in one way the place and half the play.
     """
-    cover[SIZE:, SIZE:] = np.diag([UNKNOWN] * 3)
+    most = _most(travel)
+    cover[SIZE:, SIZE:] = np.diag(most**2)
     places = np.array([(c.place, c.way) for b in blocks for c in b.crossings], dtype=np.float64).reshape(-1, 2)
     if not edges or len(places) < 4:
         return
     marks = np.array(edges)[np.abs(places[:, :1] - np.array(edges)).argmin(axis=1)]
     off = places[:, 0] - marks
     x = np.column_stack([np.ones(len(off)), marks, 0.5 * places[:, 1]]) / max(scatter, 1e-12)
-    prior = np.diag(1.0 / np.array([MOST_PLACE * travel, MOST_SCALE, MOST_PLACE * travel]))
-    q, r = np.linalg.qr(np.vstack([x, prior]))
+    q, r = np.linalg.qr(np.vstack([x, np.diag(1.0 / most)]))
     back = np.linalg.inv(r)
     theta[SIZE:] = back @ (q[: len(off)].T @ off) / max(scatter, 1e-12)
     cover[SIZE:, SIZE:] = back @ back.T
+
+
+def _most(travel: float) -> Array:
+    return np.array([MOST_PLACE * travel, MOST_SCALE, MOST_PLACE * travel])
+
+
+def _limits(travel: float) -> Array:
+    """Return the variances from which on numbers are not told."""
+    return np.concatenate([np.full(SIZE, 0.5 * UNKNOWN), 0.25 * _most(travel) ** 2])
 
 
 def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
@@ -201,11 +212,13 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     floor[:SIZE] = IDLE_SHARE * force / np.maximum(per, 1e-300)
     floor[[PLACE, PLAY]] = IDLE_PLACE * travel + IDLE_STEPS * step + scatter
     floor[SCALE] = IDLE_SCALE
+    told = np.diag(whole.noise) < _limits(travel)  # what the reference does not tell is nothing by definition
     unseen = max(0.0, 1.0 - (blocks[-1].end_s - blocks[0].start_s) / DAY_S)
     heat = np.zeros(TOTAL)
     heat[[VISCOUS, DRY]] = HEAT_VISCOUS * theta[VISCOUS], HEAT_DRY * theta[DRY]
+    known = whole.noise * np.outer(told, told)
     return Normal(
-        theta, whole.noise + UNSEEN * own + np.diag(floor**2 + unseen * heat**2), noise, force, per, loads, low, high,
+        theta, known + UNSEEN * own + np.diag(floor**2 + unseen * heat**2), noise, force, per, loads, low, high,
         edges, scatter, float(np.mean([b.error for b in blocks])), len(blocks), blocks[-1].end_s,
     )  # fmt: skip
 
@@ -254,7 +267,7 @@ def _own(
     groups = [blocks[i : i + few] for i in range(0, len(blocks) - few + 1, few)]
     each = [estimate(g, loads, edges, scatter, noise, travel) for g in groups]
     covers = np.stack([e.noise for e in each])
-    told = np.stack([np.diag(c) < UNKNOWN / 2 for c in covers])
+    told = np.stack([np.diag(c) < _limits(travel) for c in covers])
     off = np.where(told, np.stack([e.theta for e in each]) - theta, 0.0)
     spread = np.where(told, np.stack([np.diag(c) for c in covers]), np.nan)
     with np.errstate(invalid="ignore"):

@@ -31,6 +31,8 @@ APART = 1.0
 SLOW, SLOW_EVER = 0.06, 0.01
 #: A flank pushes clearly where the acceleration passes this share of its greatest value in the move.
 TURNS = 0.15
+#: What is farther away than so many widths hardly counts.
+NEAR = 2.5
 #: A commanded speed that changes by less than this share of the greatest is steady.
 STEADY = 0.01
 #: Sizes of play that the columns are made for, of the travel of the axis.
@@ -120,7 +122,8 @@ def rows_of(move: Samples, tick_s: float, greatest_speed: float, gaps: Array, kn
     if known is not None:
         u = u - known(taken[:, 0] + move.position[0], v, u)
     # where the axis stood within the filter's reach, dry friction was whatever held it
-    slowest = np.abs(windows(_spread(speed, half), taps)[::stride]).min(axis=1)
+    near = round(NEAR * width)
+    slowest = np.abs(windows(_spread(speed, half), taps)[::stride, half - near : half + near + 1]).min(axis=1)
     good = (np.abs(v) > least) & (slowest > SLOW_EVER * greatest_speed)
     if np.count_nonzero(good) < SIZE + 1:
         return None

@@ -175,9 +175,14 @@ def test_a_place_is_told_though_the_smallest_play_would_not_show() -> None:
 
 
 def blocks_at(
-    rng: np.random.Generator, speeds: list[float], dry: float, viscous: float = 8.0, noise: float = 0.1
+    rng: np.random.Generator,
+    speeds: list[float],
+    dry: float,
+    viscous: float = 8.0,
+    noise: float = 0.1,
+    mass: float = 2.0,
 ) -> list[Block]:
-    """Blocks of moves to and fro, each at a speed of its own, of an axis of 2 kg with some force noise [N]."""
+    """Blocks of moves to and fro, each at a speed of its own, of an axis with some force noise [N]."""
     collector, found = Collector(), list[Block]()
     for number, speed in enumerate(speeds * 6):
         t = np.linspace(0.0, 1.0, 500)
@@ -185,7 +190,7 @@ def blocks_at(
         x = np.zeros((500, SIZE))
         x[:, MASS], x[:, VISCOUS], x[:, DRY], x[:, CONSTANT] = np.gradient(v, t * 4.0), v, np.sign(v), 1.0
         x[:, CONSTANT + 1 :] = rng.standard_normal((500, SIZE - CONSTANT - 1))
-        y = 2.0 * x[:, MASS] + viscous * v + dry * np.sign(v) + 0.5 + noise * rng.standard_normal(500)
+        y = mass * x[:, MASS] + viscous * v + dry * np.sign(v) + 0.5 + noise * rng.standard_normal(500)
         block = collector.add(Rows(x, y, 1e-10, 4.0, 40.0 * number, speed, 0.0))
         found += [block] if block is not None else []
     return found
@@ -259,6 +264,14 @@ def test_a_short_commissioning_has_not_seen_what_a_day_does_to_friction() -> Non
     now_warmer, now_worn = (estimate(some, False, (), 0.0, 0.02, 0.4) for some in (warmer, worn))
     assert judge(day, now_warmer, 0.4).is_drift and not judge(hour, now_warmer, 0.4).is_drift
     assert "viscous friction" in judge(hour, now_worn, 0.4).names
+
+
+def test_a_mass_is_no_scale_where_no_reference_tells_one() -> None:
+    """A scale would have to be half off, and to change viscous friction as well."""
+    rng, speeds = np.random.default_rng(8), [0.05, 0.1, 0.2, 0.3]
+    was = learn(blocks_at(rng, speeds * 5, 3.0), 0.4, 1e-6)
+    heavier = blocks_at(rng, speeds, 3.0, mass=3.0)
+    assert judge(was, estimate(heavier, False, (), 0.0, was.noise, 0.4), 0.4).names == ("mass",)
 
 
 def test_the_state_comes_back_and_damaged_state_is_left_out() -> None:
