@@ -27,6 +27,8 @@ from .unit import MappedUnit, Values
 SELDOM_NS = 1_000_000_000
 SEARCH_RESTS_NS = 3_000_000_000
 """How long a drive may stand in the middle of a search for its reference."""
+HOME_TURNS = 0.005
+"""How near to 0 a drive stands that has homed and has no status bit for that, in turns of the motor."""
 REST_S = 5.0
 """Longest time that a drive may take to come to rest when it is opened [s]."""
 LOOKS_AT_REST = 10
@@ -350,6 +352,10 @@ class DriveUnit(LineUnit):
         else:
             name = next((each for each in ("done", "in_position") if each in status), None)
             done = self._bit(values, name) if name else not moving
+            if self._homes:  # what was broken off stands still as well
+                done = done and abs(float(values[self._axis.position])) <= HOME_TURNS * abs(
+                    self._mapped.gearing.travel_per_turn
+                )
         if done and self._homes and not moving:
             self._homes = False
         return moving, done

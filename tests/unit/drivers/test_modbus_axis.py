@@ -13,6 +13,7 @@ from modbus_rig import RIGS, Rig, az_rig, leadshine_rig
 
 from sioms.drivers.modbus.axis import MAPS, ModbusAxis
 from sioms.drivers.modbus.regmap_files import named_map
+from sioms.drivers.modbus.simulated import oriental_az
 from sioms.motion import CommandError
 from sioms.protocol.flags import AxisStatus, ControlMode
 from sioms.sdk.exchange import DeviceError
@@ -209,16 +210,21 @@ def test_homing(make: Callable[..., Rig]) -> None:
     assert rig.position == 0
 
 
-def test_a_homing_that_another_master_ends_is_no_home() -> None:
-    """The drive stands, without an alarm, and has no reference."""
-    rig = leadshine_rig()
-    rig.write(ControlMode.POSITION, position=0.05)
+@RIGS
+def test_a_homing_that_another_master_ends_is_no_home(make: Callable[..., Rig]) -> None:
+    """The drive stands, without an alarm, and has no reference; one family tells of that by its position only."""
+    rig = make()
+    rig.write(ControlMode.POSITION, position=0.15)
     rig.until_idle()
     for _ in range(2):  # the second time from a reference that it had
         rig.bank.home([0], rig.bus.clock_ns())
         rig.go(0.3)
-        assert rig.drive.homing
-        rig.drive.trigger(0x40)
+        assert rig.drive.state()["velocity"] != 0
+        if make is leadshine_rig:
+            rig.drive.trigger(0x40)
+        else:
+            rig.drive.write(16, 0x7C, [0, oriental_az.STOP])
+            rig.drive.write(16, 0x7C, [0, 0])
         rig.go(1.0)
         assert rig.status & AxisStatus.HOMING, "it may go on"
         rig.go(3.0)
