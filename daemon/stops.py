@@ -88,7 +88,8 @@ class Stops:
         """Clear the latch and give devices in fault another try; nothing moves by itself."""
         latched_ns = self._shared.latch.stopped_ns
         self._note(workcell_entry(who, stop=False, latched_ns=latched_ns))  # first: a later stop is noted after it
-        self._shared.latch.reset(self._request_seen)  # what has been asked for since then has not been heard
+        # What has been asked for since the mark has not been heard.
+        self._shared.latch.reset(self._request_seen, time.monotonic_ns())
         self._cell.log("warning", "reset", by=who)
         for device in self._cell.devices.values():
             device.trouble = ""
@@ -122,17 +123,19 @@ class Stops:
         before = [entry for entry in record.state.entries() if entry.get("device") == node.device]
         self._note(self._node_entry(node, who, stop=False))
         try:
-            self._order(node, driver_verbs.NodeReset, who)
+            self._order(node, driver_verbs.NodeReset, who, time.monotonic_ns())
         except OSError:
             for entry in before:
                 self._note(entry)
             raise
         self._cell.log("warning", "reset", node=node.name, by=who)
 
-    def _order(self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str) -> None:
+    def _order(
+        self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str, *at_ns: int
+    ) -> None:  # fmt: skip
         device = self._cell.devices.get(node.device) or self._cell.leaving.get(node.device)
         if device is not None and device.is_there:
-            device.send(order(node.block, node.channels, node.bit, source, self._shared.latch.resets))
+            device.send(order(node.block, node.channels, node.bit, source, self._shared.latch.resets, *at_ns))
             self._shared.latch.ordered()
 
     def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:

@@ -104,13 +104,17 @@ class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
 
 
 class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):
-    """Clear the stop and the faults of some channels; void as ``NodeStop``."""
+    """Clear the stop and the faults of some channels; void as ``NodeStop``.
+
+    ``at_ns`` is when it was sent: what clients have sent to these channels before is not taken any more.
+    """
 
     block: Integer
     channels: Array
     bit: Integer
     source: Text
     resets: Integer
+    at_ns: Integer
 
 
 class InUse(Message, on=TO_DRIVER, verb=DriverVerb.IN_USE, notice=True):

@@ -19,7 +19,7 @@ from sioms.descriptors import has_ended
 from sioms.protocol import verbs
 from sioms.protocol.compiled import add_decoders
 from sioms.protocol.driver_verbs import Attach, Detached
-from sioms.protocol.flags import REQUESTS, Access, Right
+from sioms.protocol.flags import REQUESTS, Access, Request, Right
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
@@ -149,15 +149,17 @@ class Attachments:
 
     def _readable(self, handle: Handle) -> None:
         """Serve one packet; the tick and the other clients have their turn before the next."""
+        self._service.loop.heed()  # what lies there may be older than a reset
         if handle.number not in self.handles:
             return
+        resets = self._service.stops.resets_seen
         try:
-            # Descriptors that a client may send along are dropped by the kernel, never opened here.
-            packet = handle.sock.recv(MAX_PACKET + 1)
+            packet, is_outdated = handle.take(MAX_PACKET + 1)
         except BlockingIOError:
+            handle.unread = 0
             return
         except OSError:
-            packet = b""
+            packet, is_outdated = b"", False
         handle.hear(time.monotonic_ns())
 
         def serve() -> None:
@@ -165,7 +167,7 @@ class Attachments:
                 self.drop(handle)
                 return
             number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
-            self._serve(handle, number, message, packet)
+            self._serve(handle, number, message, packet, -1 if is_outdated else resets)
 
         self._guarded(handle, serve)
 
@@ -213,14 +215,18 @@ class Attachments:
         handle.heard_ns = max(handle.heard_ns, at_ns) if handle.passed_on else at_ns
         handle.passed_on = True
 
-    def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes) -> None:
+    def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes, resets: int) -> None:
+        """Serve a message that came behind so many resets of the workcell; -1: before the last one."""
         if isinstance(message, verbs.Keepalive):
             return
         if isinstance(message, verbs.Heard):
             self.heard(handle, min(message.at_ns, handle.came_ns))
             return
         if isinstance(message, verbs.Part):
-            _keep_part(handle, message)
+            if resets < 0:
+                handle.broken = message.write
+            elif message.write != handle.broken:
+                _keep_part(handle, message)
             self._note(handle, packet, 0, "")
             return
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order
@@ -229,6 +235,8 @@ class Attachments:
         if handle.number not in self.handles:
             return  # that was the order
         try:
+            if _acts(message) and (resets != self._service.stops.resets_seen or number == handle.broken):
+                raise OSError(errno.ECANCELED, f"{handle.node}: a stop was reset after this was sent; send it again")
             value = self._value(handle, number, message)
         except OSError as error:
             why = error.errno or errno.EIO, error.strerror or str(error)
@@ -310,6 +318,14 @@ class Attachments:
         self._halt_all([handle])
         handle.close()
         self._tell(Detached(handle.number))
+
+
+def _acts(message: verbs.Message) -> bool:
+    """Return whether a message does anything but look, wait, or stop."""
+    if isinstance(message, verbs.Ioctl):
+        stops = message.request in (Request.STOP, Request.EMERGENCY_STOP, Request.FLUSH, Request.CANCEL_WAITS)
+        return not stops and not (message.request in REQUESTS and REQUESTS[message.request][2])
+    return isinstance(message, verbs.Write)
 
 
 def _keep_part(handle: Handle, message: verbs.Part) -> None:

@@ -83,7 +83,8 @@ class WriteDesk:
         writers = [
             handle
             for handle in self._clients.writers
-            if handle.block is block and not (handle.writing or handle.waits or handle.ahead[1] or handle.halted)
+            if handle.block is block
+            and not (handle.writing or handle.waits or handle.ahead[1] or handle.halted or handle.unread)
         ][:MOST_WRITERS]
         if writers != self._writers:
             self._list(writers)

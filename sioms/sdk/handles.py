@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.dated import received, unread
 from sioms.protocol.flags import Access, Right
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import refusal, reply
@@ -82,6 +83,9 @@ class Handle:
         writes: whether it may write.
         axes: ``channels`` as plain integers.
         halted: whether what it owns has been stopped because it ends.
+        unread: bytes that lay in its socket when a stop was seen to have been reset, and lie there still; reset_ns:
+            when that was [ns, CLOCK_MONOTONIC].
+        broken: number of a write some records of which had come before that reset.
     """
 
     number: int
@@ -110,12 +114,34 @@ class Handle:
     writing: list[Writing] = field(default_factory=list)
     ahead: tuple[int, list[bytes]] = (0, [])
     halted: bool = False
+    unread: int = 0
+    reset_ns: int = 0
+    broken: int = -1
     writes: bool = field(init=False)
     axes: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
         self.axes = self.channels.tolist()
+
+    def outdate(self, reset_ns: int) -> None:
+        """Have what the client has sent before a reset be recognised, as far as it has not been read yet."""
+        if self.ahead[1]:
+            self.broken, self.ahead = self.ahead[0], (0, [])
+        self.unread, self.reset_ns = unread(self.sock), reset_ns
+
+    def take(self, most: int) -> tuple[bytes, bool]:
+        """Return the next packet, of ``most`` bytes, and whether it was sent before a reset that has been seen.
+
+        Raises:
+            OSError: as ``socket.recv``.
+        """
+        # Descriptors that a client may send along are dropped by the kernel, never opened here.
+        if not self.unread:
+            return self.sock.recv(most), False
+        packet, sent_ns = received(self.sock, most)
+        self.unread = max(0, self.unread - len(packet))
+        return packet, sent_ns < self.reset_ns
 
     def hear(self, now_ns: int) -> None:
         """Note that a packet of the client has come [ns, CLOCK_MONOTONIC]."""

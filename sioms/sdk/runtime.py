@@ -691,7 +691,7 @@ class Runtime:
                 if was_held:
                     self._stop_held()
             case driver_verbs.NodeStop() | driver_verbs.NodeReset():
-                block, channels, bit, text, resets = message
+                block, channels, bit, text, resets, *at_ns = message
                 self.stops.heed()  # a reset that came before it must not come after it
                 if resets != self.latch.resets:
                     return  # the workcell has been reset since then: of all that, nothing is left
@@ -699,7 +699,7 @@ class Runtime:
                     self.stops.stop_node(self.blocks[block], channels, bit, text)
                     return
                 try:
-                    self.stops.reset_node(self.blocks[block], channels, bit, "reset")
+                    self.stops.reset_node(self.blocks[block], channels, bit, "reset", sent_ns=at_ns[0])
                 except (OSError, CommandError) as error:
                     self.log("warning", str(error))
             case _:

@@ -149,6 +149,11 @@ class Stops:
         return (*self._seen[:2], self._orders)
 
     @property
+    def resets_seen(self) -> int:
+        """How many resets of the workcell have been seen."""
+        return self._seen[1]
+
+    @property
     def seen_request(self) -> Mark:
         """The mark of the stop-request file that has been seen."""
         return self._seen[2]
@@ -184,6 +189,8 @@ class Stops:
         mark, fresh = self.latch_request()
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
+        if resets != seen_resets:
+            self._outdate(latch.reset_ns)
         if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
             self._stops_again, self.stopped = self.stopped and not stopped_ns, True
             self.safe_stop(_emergency_stop_by(self.source))
@@ -200,6 +207,13 @@ class Stops:
             for block in self._blocks:
                 if isinstance(block, AxisBlock):
                     self._reset_axes(block, range(block.n))
+
+    def _outdate(self, reset_ns: int, block: AnyBlock | None = None, channels: Iterable[int] = ()) -> None:
+        """Let nothing be taken that clients have sent to channels of a block, or to the device, before a reset."""
+        reset = set(channels)
+        for handle in self._handles.values():
+            if block is None or (handle.block is block and not reset.isdisjoint(handle.axes)):
+                handle.outdate(reset_ns)
 
     def look_at_inputs(self) -> None:
         """Stop the workcell when an input that is to stop it reads so."""
@@ -322,20 +336,25 @@ class Stops:
                     self.latched_outputs[id(block), *part] = source
         self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
 
-    def reset_node(self, block: AnyBlock, channels: Any, bit: int, what: str, until_ns: int | None = None) -> None:
+    def reset_node(
+        self, block: AnyBlock, channels: Any, bit: int, what: str, until_ns: int | None = None, sent_ns: int = 0
+    ) -> None:  # fmt: skip
         """Clear the latched stop and faults of some channels, or the stop of one bit of them.
 
         Args:
             block, channels, bit: what is reset.
             what: in words.
             until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
+            sent_ns: when the reset was sent; 0: now.
 
         Raises:
             OSError: as ``check_reset``.
         """
         self.check_reset(block, channels, what, until_ns)
         self._effects.note()
-        self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
+        now_ns, reset = time.monotonic_ns(), [int(c) for c in channels]
+        self._events.note(Note.RESET, now_ns, block.spec.name, reset)
+        self._outdate(sent_ns or now_ns, block, reset)
         if isinstance(block, AxisBlock):
             self._reset_axes(block, channels)
             return
@@ -375,8 +394,10 @@ class Stops:
         self.check_reset(handle.block, handle.channels, what, until_ns)
         self.note_node(handle, handle.who, stop=False)
         heed()
+        before = handle.unread, handle.reset_ns
         try:
             self.reset_node(handle.block, handle.channels, handle.bit, what, until_ns)
+            handle.unread, handle.reset_ns = before  # what comes behind its own request was sent after it
         except OSError:
             self.note_node(handle, f"a stop that came during a reset by {handle.who}", stop=True)
             raise

@@ -15,15 +15,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_rig import Daemon, Waiting, raises, wait_for
+from daemon_rig import Daemon, Waiting, axes, raises, wait_for
 from wire_rig import SLIDE, Wire
 
 import sioms
 from sioms.client.channel import Call, Channel
+from sioms.client.command import command
 from sioms.client.connecting import connect
-from sioms.protocol.flags import PROTOCOL_VERSION
+from sioms.protocol.flags import PROTOCOL_VERSION, Request
 from sioms.protocol.records import BINARY_WRITE
-from sioms.protocol.verbs import Hello, Write
+from sioms.protocol.verbs import Hello, Ioctl, Message, Write
 
 
 def test_the_stop_request_file_cannot_be_taken_away(daemon: Daemon, cell: sioms.Workcell) -> None:
@@ -191,6 +192,32 @@ def test_writes_on_their_way_do_not_come_after_an_emergency_stop(port: tuple[Dae
         assert device.value == 0, f"written: {device.written}"
         node.set(1)
         assert device.value == 1
+
+
+def test_what_was_sent_before_a_stop_is_not_taken_after_its_reset(start_daemon: Callable[..., Daemon]) -> None:
+    """A driver that has had no processor meanwhile reads it only then."""
+    daemon = start_daemon('[workcell]\nname = "test"\n' + axes("mod0", "xaxis"))
+    pid = daemon.device("mod0")["pid"]
+    jog = Write(0, 0.0, command(0, velocity=0.1))
+    with daemon.cell("writer") as cell, cell.open("mod0", "rw") as node, daemon.cell("other") as other:
+
+        def send(message: Message) -> Call:
+            node._channel.send(call := Call("request", message))
+            return call
+
+        os.kill(pid, signal.SIGSTOP)
+        try:
+            early = [send(message) for message in (jog, Ioctl(int(Request.HOME), None, 0.0), jog)]
+            other.emergency_stop()
+            other.reset()
+            late = send(jog)
+        finally:
+            os.kill(pid, signal.SIGCONT)
+        for call in early:
+            with raises(errno.ECANCELED, "mod0", "was reset after this was sent"):
+                node._channel.wait(call.number, call)
+        node._channel.wait(late.number, late)
+        wait_for(lambda: node.read().velocity[0] > 0.05, "what was sent after the reset")
 
 
 def test_outputs_whose_writer_went_during_a_loss_are_made_safe_after_it(port: tuple[Daemon, Device]) -> None:

@@ -16,7 +16,7 @@ from typing import Any
 
 import pytest
 from daemon_rig import axes
-from own_writes_rig import DEVICE, Client, Device, OnLine, Pushing, World, worlds
+from own_writes_rig import CLOCK, DEVICE, Client, Device, OnLine, Pushing, World, worlds
 
 from sioms.client import shown
 from sioms.client.command import command
@@ -207,7 +207,7 @@ def _axis_acts(
         if not by_daemon:
             owner.ioctl(Request.RESET, None, done)
         elif not world.latch.stopped_ns:
-            world.order(DriverVerb.NODE_RESET, 0, [number], -1, "somebody", world.latch.resets)
+            world.order(DriverVerb.NODE_RESET, 0, [number], -1, "somebody", world.latch.resets, CLOCK())
             done(None)
 
     def stop_all() -> None:
