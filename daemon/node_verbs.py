@@ -17,7 +17,6 @@ from functools import partial
 from typing import Any
 
 from sioms.dated import date_what_comes
-
 from sioms.protocol.driver_verbs import Attach, Detach
 from sioms.protocol.flags import READONLY, Access, Right
 from sioms.protocol.journal import Note

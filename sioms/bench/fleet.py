@@ -29,7 +29,7 @@ from sioms.client.command import command
 from sioms.client.fleet import Fleet
 from sioms.client.keys import VARIABLE
 from sioms.client.workcell import Workcell
-from sioms.client.zenoh_keys import config, endpoint
+from sioms.client.zenoh_keys import config, endpoint, open_session
 from sioms.protocol.flags import AxisStatus
 
 from .again import connect_again
@@ -47,8 +47,8 @@ _ECHO = """
 import sys, time, zenoh
 from zenoh.handlers import Callback
 from sioms.client.keys import Folder
-from sioms.client.zenoh_keys import config, endpoint
-session = zenoh.open(config(Folder(sys.argv[1]), "listen", mode="router", listen={"endpoints": [sys.argv[2]]}))
+from sioms.client.zenoh_keys import config, endpoint, open_session
+session = open_session(config(Folder(sys.argv[1]), "listen", mode="router", listen={"endpoints": [sys.argv[2]]}))
 options = dict(congestion_control=zenoh.CongestionControl.BLOCK, priority=zenoh.Priority.REAL_TIME, express=True)
 back = session.declare_publisher("bare/back", **options)
 there = session.declare_subscriber("bare/there", Callback(lambda sample: back.put(sample.payload), indirect=False))
@@ -69,7 +69,7 @@ class BareRound:
         assert self._process.stdout is not None
         self._process.stdout.readline()
         connect = {"endpoints": [place], "timeout_ms": 5000, "exit_on_failure": True}
-        self._session = zenoh.open(config(gateway.own, "connect", mode="client", connect=connect))
+        self._session = open_session(config(gateway.own, "connect", mode="client", connect=connect))
         self._came = threading.Semaphore(0)
         self._subscriber = self._session.declare_subscriber("bare/back", Callback(self._back, indirect=False))
         self._publisher = self._session.declare_publisher(

@@ -34,10 +34,27 @@ QUEUES = {"control": 4, "real_time": 2, "interactive_high": 16, "interactive_low
           "data_low": 1, "background": 1}  # fmt: skip
 """Frames are sent with priority ``interactive_high``, stops with ``real_time``, which overtakes them."""
 
-os.environ.setdefault(
-    "ZENOH_RUNTIME",
-    "(acc: (handover: app), rx: (handover: app), tx: (handover: app), app: (worker_threads: 1))",
-)  # read by Zenoh when the first session is opened: a frame changes threads once and not three times
+_RUNTIME = "ZENOH_RUNTIME"
+_ONE_THREAD = "(acc: (handover: app), rx: (handover: app), tx: (handover: app), app: (worker_threads: 1))"
+"""A frame changes threads once and not three times."""
+
+
+def open_session(how: zenoh.Config) -> zenoh.Session:
+    """Open a session whose library works in one thread, unless the environment or an earlier session says otherwise.
+
+    Zenoh reads that from the environment when a process opens its first session; what the process starts must not
+    inherit it.
+
+    Raises:
+        zenoh.ZError: there is no way to the other end.
+    """
+    if _RUNTIME in os.environ:
+        return zenoh.open(how)
+    os.environ[_RUNTIME] = _ONE_THREAD
+    try:
+        return zenoh.open(how)
+    finally:
+        os.environ.pop(_RUNTIME, None)
 
 
 def config(folder: Folder, role: str, blocked_us: int = BLOCKED_US, **more: Any) -> zenoh.Config:

@@ -28,7 +28,7 @@ from sioms.protocol.link import Up
 from .certificates import AUTHORITY, CERTIFICATE, CERTIFICATE_KEY, own
 from .keys import Folder
 from .places import probe
-from .zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint
+from .zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint, open_session
 
 BLOCKED_US = 1_000_000
 """How long a frame may wait for a connection that takes none before that is given up [us]."""
@@ -191,7 +191,7 @@ class _Opening:
             self._go_on()
             self._count += 1
         try:
-            session = zenoh.open(how)
+            session = open_session(how)
             if self._is_over:
                 session.close()  # type: ignore[no-untyped-call]
                 self._go_on()

@@ -25,7 +25,7 @@ from zenoh.handlers import Callback
 
 from sioms.client.certificates import NUMBERS, own
 from sioms.client.keys import Folder
-from sioms.client.zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint
+from sioms.client.zenoh_keys import ALIVE, DOWN, GATEWAY, STOP, UP, config, endpoint, open_session
 from sioms.prompt import BoundedPrompt, be_prompt
 from sioms.protocol import link
 from sioms.protocol.link import Down, MalformedFrame
@@ -131,7 +131,7 @@ class Zenoh:
         }  # fmt: skip
         at = f"{endpoint(host, port)}#tls_handshake_timeout_ms={HANDSHAKE_MS}"
         try:
-            self._session = zenoh.open(
+            self._session = open_session(
                 config(
                     folder, "listen", mode="router", listen={"endpoints": [at]},
                     low_pass_filter=[limit], access_control=access(),

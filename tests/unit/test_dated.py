@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from sioms.dated import date_what_comes, received, unread
 
+from sioms.dated import date_what_comes, received, unread
 from sioms.protocol.flags import Access, Right
 from sioms.sdk.handles import Handle
 
