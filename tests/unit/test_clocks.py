@@ -22,6 +22,7 @@ SHOWN = {
     "sioms/check/other_clock.py": "what stated uncertainties of UTC are compared with",
     "sioms/client/certificates.py": "whether a certificate has expired, to say so; TLS judges by itself",
     "sioms/client/wall.py": "the wall clock of a reading, for who asks for it",
+    "sioms/dated.py": "dates of the kernel; where that clock has been set, a packet counts as old and is refused",
     "sioms/gateway/certificates.py": "from when until when a certificate is valid",
     "sioms/reconcile/live/watch.py": "since when an axis drifts, as text",
     "sioms/reconcile/report/watch.py": "since when an axis drifts, as text",

@@ -46,9 +46,23 @@ def test_packets_tell_when_they_were_sent(pair: Pair) -> None:
     assert unread(theirs) == 231
     for size, before, after in zip((1, 200, 30), between, between[1:], strict=False):
         packet, sent_ns = received(theirs, 4096)
-        assert len(packet) == size and before < sent_ns < after
+        assert len(packet) == size and before - 100_000 < sent_ns < after
     with pytest.raises(BlockingIOError):
         received(theirs, 4096)
+
+
+def test_what_lies_there_while_the_clock_is_set_counts_as_old(pair: Pair, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = pair
+    for step_ns in (3_600_000_000_000, -3_600_000_000_000):
+        ours.send(b"x")
+        real = time.time_ns
+        monkeypatch.setattr(time, "time_ns", lambda real=real, step_ns=step_ns: real() + step_ns)
+        assert received(theirs, 10) == (b"x", 0)
+        monkeypatch.undo()
+        ours.send(b"y")
+        assert received(theirs, 10) == (b"y", 0), "it was set again"
+        ours.send(b"z")
+        assert received(theirs, 10)[1] > 0
 
 
 def test_descriptors_that_come_along_are_not_opened(pair: Pair) -> None:
@@ -65,6 +79,7 @@ def test_what_lay_there_at_a_reset_is_outdated_and_what_comes_behind_is_not(pair
     ours.send(b"early")
     ours.send(b"too")
     reset_ns = time.monotonic_ns()
+    time.sleep(0.002)
     ours.send(b"late")  # before the driver has seen the reset
     handle.outdate(reset_ns)
     ours.send(b"later")
