@@ -152,7 +152,12 @@ class Recording:
     def __init__(self, path: str | Path) -> None:
         self.path = str(path)
         # A pipe would hold up who opens it.
-        self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise OSError(
+                error.errno, f"read {path}: {(error.strerror or str(error)).lower()}; want a recording"
+            ) from None
         try:
             what = os.fstat(self._fd)
             self.size = what.st_size

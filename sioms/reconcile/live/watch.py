@@ -158,7 +158,11 @@ def watched(info: NodeInfo, model: AxisModel | None, reference: str, settings: S
 
 
 def load(path: Path | None, axes: Mapping[str, Watched], offset_s: float, say: Callable[[str], None]) -> None:
-    """Let watches go on with what was kept; what is damaged is told and left out."""
+    """Let watches go on with what was kept; what is damaged is told and left out, and its file is kept beside.
+
+    Raises:
+        OSError: it cannot be read, or not be renamed.
+    """
     if path is None:
         return
     try:
@@ -168,8 +172,10 @@ def load(path: Path | None, axes: Mapping[str, Watched], offset_s: float, say: C
             raise ValueError("it is no state of a watch")
     except FileNotFoundError:
         return
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        say(f"{path}: nothing of it is used, and the axes are learnt anew: {error}")
+    except (ValueError, KeyError, TypeError) as error:
+        beside = path.with_name(f"{path.name}.damaged")
+        path.replace(beside)  # it may be another file, whose name was given by mistake
+        say(f"read the state {path}: {error}; it is now {beside.name}, and the axes are learnt anew")
         return
     for name, axis in axes.items():
         if name not in table:

@@ -16,7 +16,7 @@ from .moves import Array
 from .normal import ALL_NAMES, Normal
 from .rows import SIZE
 
-VERSION = 1
+VERSION = 2
 _TOTAL = len(ALL_NAMES)
 _SHAPES: Mapping[str, tuple[int, ...]] = {
     "gram": (SIZE + 1, SIZE + 1), "freed": (SIZE, SIZE), "theta": (_TOTAL,), "own": (_TOTAL, _TOTAL), "per": (SIZE,),
@@ -49,7 +49,8 @@ def restore(watch: AxisWatch, kept: Any, offset_s: float) -> str:
     """
     try:
         if not isinstance(kept, dict) or kept.get("version") != VERSION:
-            raise ValueError("it is of another version")
+            found = kept.get("version") if isinstance(kept, dict) else None
+            raise ValueError(f"it is of version {str(found)[:20]}; want {VERSION}")
         about = asdict(watch.about) | {"force_max": min(watch.about.force_max, 1e300)}
         other = [key for key, value in about.items() if kept["about"].get(key) != value]
         if other:
