@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
-from sioms.dated import date_what_comes
+from sioms.descriptors import enable_timestamps
 from sioms.protocol.driver_verbs import Attach, Detach
 from sioms.protocol.flags import READONLY, Access, Right
 from sioms.protocol.journal import Note
@@ -219,7 +219,7 @@ class NodeVerbs:
             access &= ~Access.WRITE
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER)
-        date_what_comes(theirs)  # before the client can send
+        enable_timestamps(theirs)  # before the client can send
         readable, wake = os.pipe2(os.O_CLOEXEC | os.O_NONBLOCK)
         try:
             fds = [theirs.fileno(), wake] + ([session.pidfd] if session.pidfd >= 0 else [])

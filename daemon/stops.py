@@ -89,7 +89,7 @@ class Stops:
         latched_ns = self._shared.latch.stopped_ns
         self._note(workcell_entry(who, stop=False, latched_ns=latched_ns))  # first: a later stop is noted after it
         # What has been asked for since the mark has not been heard.
-        self._shared.latch.reset(self._request_seen, time.monotonic_ns())
+        self._shared.latch.reset(time.monotonic_ns(), self._request_seen)
         self._cell.log("warning", "reset", by=who)
         for device in self._cell.devices.values():
             device.trouble = ""

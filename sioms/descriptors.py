@@ -21,7 +21,14 @@ class HasDescriptor(Protocol):
         ...
 
 
+SO_TIMESTAMPNS = 35
+"""Socket option, and kind of the message that comes with a packet: <asm-generic/socket.h>."""
 Source = TypeVar("Source", bound=int | HasDescriptor)
+
+
+def enable_timestamps(sock: socket.socket) -> None:
+    """Have the kernel add to every packet that is sent to a Unix socket from now on when that was [CLOCK_REALTIME]."""
+    sock.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
 
 
 def receive(sock: socket.socket, most_bytes: int, most_fds: int) -> tuple[bytes, list[int]]:

@@ -21,6 +21,7 @@ import msgspec
 import numpy as np
 import pytest
 from ownership_fakes import Timer
+from sent_rig import SentTimes
 
 import sioms.client.node_core
 import sioms.motion.bank
@@ -32,7 +33,7 @@ from sioms.client import shown
 from sioms.client.channel import Call, Channel
 from sioms.client.local import LocalPage
 from sioms.client.node_core import NodeCore
-from sioms.descriptors import is_readable
+from sioms.descriptors import enable_timestamps, is_readable
 from sioms.motion import AxisSettings, DriveAction
 from sioms.protocol.driver_verbs import Attach, DriverVerb
 from sioms.protocol.flags import Access, ControlMode, NodeClass, Request, Right
@@ -67,9 +68,14 @@ class Client:
 
     def send(self, call: Call, done: Done) -> None:
         """Send a request; ``done`` is called with the answer, or the refusal, when that has come."""
-        self.pending[self.channel.send(call)] = done
+        self.post(call, done)
         self.world.serve(self)
         self.take()
+
+    def post(self, call: Call, done: Done = lambda _: None) -> None:
+        """Send a request that the driver has not come to serve yet."""
+        SENT.note()
+        self.pending[self.channel.send(call)] = done
 
     def take(self) -> None:
         """Take the answers that have come."""
@@ -144,31 +150,18 @@ class World:
                 return
         raise AssertionError("the driver does not come up")
 
-    def open(self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1, uid: int = 1000) -> Client:
-        """Open a node as the daemon does."""
+    def open(
+        self, block: int, channels: Sequence[int], *, exclusive: bool, bit: int = -1, uid: int = 1000,
+        early: Callable[[Client], None] = lambda _: None,
+    ) -> Client:  # fmt: skip
+        """Open a node as the daemon does; ``early`` is what its client does before the driver hears of it."""
         self.runtime._wake()
         number = max((client.node.handle for client in self.clients), default=0) + 1
         shown_block = self.runtime.blocks[block]
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        enable_timestamps(theirs)
         readable, wake = os.pipe2(os.O_NONBLOCK)
         access = Access.READ | Access.WRITE if exclusive else Access.READ
-        self.runtime.clients.attach(
-            [theirs.detach(), wake],
-            Attach(
-                number,
-                block,
-                list(channels),
-                bit,
-                int(access),
-                exclusive,
-                int(Right.ALL),
-                0,
-                "tester",
-                uid,
-                [256, 128],
-                f"node{number}",
-            ),
-        )
         spec = shown_block.spec
         info = NodeInfo(
             [f"node{number}", int(spec.node_class), not exclusive, [spec.channels[c].pack() for c in channels], bit,
@@ -178,8 +171,17 @@ class World:
         fd = os.dup(self.page_fds[block])
         node = NodeCore(info, number, LocalPage(fd, readable), list(channels), bit, channel)
         node._owe()
-        self.clients.append(Client(self, node, channel))
-        return self.clients[-1]
+        client = Client(self, node, channel)
+        early(client)
+        self.runtime.clients.attach(
+            [theirs.detach(), wake],
+            Attach(
+                number, block, list(channels), bit, int(access), exclusive, int(Right.ALL), 0, "tester", uid,
+                [256, 128], f"node{number}",
+            ),
+        )  # fmt: skip
+        self.clients.append(client)
+        return client
 
     def close_node(self, client: Client) -> None:
         """Close a node as the daemon does when its client has."""
@@ -333,6 +335,7 @@ class World:
             self.device.close()
         for timer in (self.runtime._timer, self.runtime._line_timer):
             os.close(timer.fd)
+        self.runtime.clients.close()
         self.runtime._epoll.close()
         self.runtime._control.close()
         self.control.close()
@@ -364,6 +367,7 @@ class _Clock:
 
 
 CLOCK = _Clock()
+SENT = SentTimes(CLOCK)
 
 
 @contextmanager
@@ -380,6 +384,7 @@ def own_time(world: list[World]) -> Iterator[None]:
         patch.setattr(time, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "sleep", sleep)
+        SENT.install(patch)
         patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
         patch.setattr(sioms.sdk.quiet, "run", lambda record: world[0].run_quietly(record))
         patch.setattr(sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings))

@@ -320,6 +320,7 @@ class Process:
         for handle in runtime.clients.handles.values():
             handle.close()
         runtime._control.close()
+        runtime.clients.close()
         runtime._epoll.close()
         runtime.stops._request.close()
         runtime.stops._journal.close()

@@ -25,7 +25,7 @@ from .arrival import Arrivals
 from .commands import WIRE_DTYPE, Command
 from .plain import MOST
 from .plain_step import Plain, plain_of
-from .queue import EMERGENCY_STOP, LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
+from .queue import EMERGENCY_STOP, FAULT, LOST, AxesLike, CommandQueue, Judged, Judgement, LimitValue, verdict
 from .settings import AxisSettings
 from .store import NEVER_NS
 from .types import CommandError, Event, EventKind, Keeper, MarkerPort
@@ -294,6 +294,10 @@ class Bank(ABC):
         searching = chosen[(self._queue.latched[chosen] & int(AxisStatus.HOMING)) != 0]
         if searching.size:  # whose place was lost before
             self.fault(searching, text, now_ns)
+
+    def is_latched(self, axis: int) -> bool:
+        """Tell whether an axis is stopped by an emergency stop or in fault, until ``reset``."""
+        return bool(self._queue.latched.item(axis) & (EMERGENCY_STOP | FAULT))
 
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""

@@ -93,7 +93,7 @@ class Input(Message, on=TO_DRIVER, verb=DriverVerb.INPUT, notice=True, states=("
 class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
     """Emergency stop of some channels, or of one bit of them (-1: all).
 
-    ``resets`` is how often the workcell had been reset; ignored when the driver has seen a later reset.
+    ``resets`` is how often the workcell had been reset; after a later reset what moves stops, and is not latched.
     """
 
     block: Integer
@@ -104,9 +104,9 @@ class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
 
 
 class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):
-    """Clear the stop and the faults of some channels; void as ``NodeStop``.
+    """Clear the stop and the faults of some channels; void when the workcell has been reset since.
 
-    ``at_ns`` is when it was sent: what clients have sent to these channels before is not taken any more.
+    ``at_ns`` is when it was sent: what clients have sent before to what was stopped is not taken any more.
     """
 
     block: Integer

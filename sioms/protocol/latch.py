@@ -10,7 +10,7 @@ This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-r
 from .text import printable
 
 LATCH_SIZE = 4096
-_STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS, _RESET_AT = 0, 1, 2, 3, 4, 5, 6
+_STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS, _RESET_AT, _ENDED = range(8)
 _TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
 
 
@@ -41,6 +41,11 @@ class Latch:
     def reset_ns(self) -> int:
         """When the latch was cleared last [ns, CLOCK_MONOTONIC]; 0: never. It is there before ``resets`` changes."""
         return self._words[_RESET_AT]
+
+    @property
+    def ended_stop_ns(self) -> int:
+        """Which stop was the last that a reset has ended, as ``stopped_ns``; 0: none. As ``reset_ns``."""
+        return self._words[_ENDED]
 
     @property
     def daemon_alive_ns(self) -> int:
@@ -78,14 +83,15 @@ class Latch:
         """Mark of the stop-request file that the last reset answered: no new request to who sees it only now."""
         return self._words[_ANSWERED], self._words[_ANSWERED_AT]
 
-    def reset(self, request: tuple[int, int] = (0, 0), now_ns: int = 0) -> None:
+    def reset(self, now_ns: int, request: tuple[int, int] = (0, 0)) -> None:
         """Clear the latch (the daemon's, on behalf of somebody entitled).
 
         Args:
+            now_ns: time of the reset: what clients have sent before it is not taken after it [ns, CLOCK_MONOTONIC].
             request: mark of the stop-request file that is thereby answered.
-            now_ns: time of the reset: what clients have sent before it is not taken after it.
         """
         self._words[_RESET_AT] = now_ns
+        self._words[_ENDED] = self._words[_STOPPED] or self._words[_ENDED]
         self._words[_ANSWERED], self._words[_ANSWERED_AT] = request  # before the latch opens
         self._words[_RESETS] += 1
         self._words[_STOPPED] = 0

@@ -11,7 +11,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -32,12 +32,26 @@ from .handles import LATER, Handle, Quota
 from .parts import Service
 from .requests import ioctl
 from .stops import Reason, Stop
-from .writing import take_plain, write
+from .timestamps import Timestamps, receive
+from .writing import concerned, take_plain, write
 
 OWNERS, READERS = 0, 1
 SHARES = (0.85, 0.125)
 """Of its time, what a driver spends at most on the requests of who owns outputs, and on those of all others."""
 add_decoders(verbs.ON_HANDLE)
+UNKNOWN = -1
+
+
+class Came(NamedTuple):
+    """How a packet came.
+
+    Args:
+        resets: how many resets had been seen when it was sent, at least; UNKNOWN: it lay there when one was seen.
+        timestamp_ns: of the kernel [ns, CLOCK_REALTIME].
+    """
+
+    resets: int
+    timestamp_ns: int
 
 
 class Attachments:
@@ -57,11 +71,16 @@ class Attachments:
     ) -> None:  # fmt: skip
         self.handles = handles
         self._service, self._turns, self._tell, self._journal = service, turns, tell, journal
+        self.timestamps = Timestamps()
         self._leased: list[Handle] = []
         self._owners: dict[int, Handle] = {}
         """Who owns outputs, by the descriptors that tell of his end."""
         self.writers: list[Handle] = []
         """Handles that may write."""
+
+    def close(self) -> None:
+        """Release the descriptor that is not a handle's."""
+        self.timestamps.close()
 
     def check_leases(self, now_ns: int) -> None:
         """End the handles whose clients have been silent for longer than their leases."""
@@ -135,6 +154,8 @@ class Attachments:
             time.monotonic_ns(), self._service.effects, Quota(*quota),
         )  # fmt: skip
         self.handles[number] = handle
+        if self._service.stops.resets.count:  # its client may have used it for long already
+            handle.note_reset()
         if exclusive:
             self._owners |= dict.fromkeys((sock.fileno(), *([handle.pidfd] if handle.pidfd >= 0 else [])), handle)
         if lease_ns:
@@ -152,14 +173,15 @@ class Attachments:
         self._service.loop.heed()  # what lies there may be older than a reset
         if handle.number not in self.handles:
             return
-        resets = self._service.stops.resets_seen
+        resets = self._service.stops.resets.count
         try:
-            packet, is_outdated = handle.take(MAX_PACKET + 1)
+            packet, timestamp_ns = receive(handle.sock, MAX_PACKET + 1)
         except BlockingIOError:
-            handle.unread = 0
+            handle.queued_bytes = 0
             return
         except OSError:
-            packet, is_outdated = b"", False
+            packet, timestamp_ns = b"", 0
+        came = Came(UNKNOWN if handle.was_queued(len(packet)) else resets, timestamp_ns)
         handle.hear(time.monotonic_ns())
 
         def serve() -> None:
@@ -167,7 +189,7 @@ class Attachments:
                 self.drop(handle)
                 return
             number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
-            self._serve(handle, number, message, packet, -1 if is_outdated else resets)
+            self._serve(handle, number, message, packet, came)
 
         self._guarded(handle, serve)
 
@@ -215,17 +237,16 @@ class Attachments:
         handle.heard_ns = max(handle.heard_ns, at_ns) if handle.passed_on else at_ns
         handle.passed_on = True
 
-    def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes, resets: int) -> None:
-        """Serve a message that came behind so many resets of the workcell; -1: before the last one."""
+    def _serve(self, handle: Handle, number: int, message: verbs.Message, packet: bytes, came: Came) -> None:
         if isinstance(message, verbs.Keepalive):
             return
         if isinstance(message, verbs.Heard):
             self.heard(handle, min(message.at_ns, handle.came_ns))
             return
         if isinstance(message, verbs.Part):
-            if resets < 0:
-                handle.broken = message.write
-            elif message.write != handle.broken:
+            if self._is_stale(handle, message, came):
+                handle.stale_write = message.write
+            elif message.write != handle.stale_write:
                 _keep_part(handle, message)
             self._note(handle, packet, 0, "")
             return
@@ -235,8 +256,10 @@ class Attachments:
         if handle.number not in self.handles:
             return  # that was the order
         try:
-            if _acts(message) and (resets != self._service.stops.resets_seen or number == handle.broken):
-                raise OSError(errno.ECANCELED, f"{handle.node}: a stop was reset after this was sent; send it again")
+            if _acts(message) and (number == handle.stale_write or self._is_stale(handle, message, came)):
+                raise OSError(
+                    errno.ECANCELED, f"{_what(message)} {handle.node}: sent before the last reset; send it again"
+                )
             value = self._value(handle, number, message)
         except OSError as error:
             why = error.errno or errno.EIO, error.strerror or str(error)
@@ -247,6 +270,14 @@ class Attachments:
                 handle.answer(number, value)
             if not message.query and not (isinstance(message, verbs.Ioctl) and REQUESTS[message.request][2]):
                 self._note(handle, packet, 0, "")
+
+    def _is_stale(self, handle: Handle, message: verbs.Message, came: Came) -> bool:
+        """Return whether what a message is for was stopped, and reset, after it had been sent."""
+        resets = self._service.stops.resets
+        if came.resets == resets.count:
+            return False
+        reset_ns = resets.latest_ns(handle.block, concerned(handle, message), handle.number)
+        return self.timestamps.monotonic_ns(came.timestamp_ns) < reset_ns
 
     def _note(self, handle: Handle, packet: bytes, errno_: int, why: str) -> None:
         """Note a command, after its answer has been sent: a client does not wait for that."""
@@ -326,6 +357,10 @@ def _acts(message: verbs.Message) -> bool:
         stops = message.request in (Request.STOP, Request.EMERGENCY_STOP, Request.FLUSH, Request.CANCEL_WAITS)
         return not stops and not (message.request in REQUESTS and REQUESTS[message.request][2])
     return isinstance(message, verbs.Write)
+
+
+def _what(message: verbs.Message) -> str:
+    return f"{Request(message.request).name} on" if isinstance(message, verbs.Ioctl) else "write"
 
 
 def _keep_part(handle: Handle, message: verbs.Part) -> None:

@@ -82,6 +82,9 @@ class Engine(Protocol):
     def write_outputs(self, handle: Handle, number: int, block: AnyBlock, changes: Mapping[int, Change]) -> Any:
         """Set outputs for a client."""
 
+    def drop_writes(self, block: AnyBlock, masks: Mapping[int, int]) -> None:
+        """Let no write go on that is on its way to these outputs: of each channel these bits, -1: all."""
+
     def make_safe(self, block: AnyBlock) -> None:
         """Send the safe values that are wanted of a block (Outputs) now; later looks send what was lost."""
 

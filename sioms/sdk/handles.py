@@ -21,13 +21,13 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.dated import received, unread
 from sioms.protocol.flags import Access, Right
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import refusal, reply
 
 from .blocks import AnyBlock
 from .effects import Effects
+from .timestamps import pending_bytes
 
 LOOKS_A_MS = 16
 """Waits of each user that are looked at, for every millisecond of a tick's period: some 20 us, 100 where all are
@@ -48,6 +48,10 @@ class Writing(Protocol):
     """A write of axis records that is not in the buffers yet, or a request that comes after such writes."""
 
     lacks_room: bool
+
+    @property
+    def axes(self) -> frozenset[int]:
+        """The axes of the block that it is for."""
 
     @property
     def replaces(self) -> bool:
@@ -83,9 +87,8 @@ class Handle:
         writes: whether it may write.
         axes: ``channels`` as plain integers.
         halted: whether what it owns has been stopped because it ends.
-        unread: bytes that lay in its socket when a stop was seen to have been reset, and lie there still; reset_ns:
-            when that was [ns, CLOCK_MONOTONIC].
-        broken: number of a write some records of which had come before that reset.
+        queued_bytes: how much of what lay in its socket when a reset was seen lies there still.
+        stale_write: number of a write some records of which were sent before a reset.
     """
 
     number: int
@@ -114,9 +117,8 @@ class Handle:
     writing: list[Writing] = field(default_factory=list)
     ahead: tuple[int, list[bytes]] = (0, [])
     halted: bool = False
-    unread: int = 0
-    reset_ns: int = 0
-    broken: int = -1
+    queued_bytes: int = 0
+    stale_write: int = -1
     writes: bool = field(init=False)
     axes: list[int] = field(init=False)
 
@@ -124,24 +126,17 @@ class Handle:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
         self.axes = self.channels.tolist()
 
-    def outdate(self, reset_ns: int) -> None:
-        """Have what the client has sent before a reset be recognised, as far as it has not been read yet."""
+    def note_reset(self) -> None:
+        """Note that what it shows has been reset: of what lies in its socket it matters when that was sent."""
         if self.ahead[1]:
-            self.broken, self.ahead = self.ahead[0], (0, [])
-        self.unread, self.reset_ns = unread(self.sock), reset_ns
+            self.stale_write, self.ahead = self.ahead[0], (0, [])
+        self.queued_bytes = pending_bytes(self.sock)
 
-    def take(self, most: int) -> tuple[bytes, bool]:
-        """Return the next packet, of ``most`` bytes, and whether it was sent before a reset that has been seen.
-
-        Raises:
-            OSError: as ``socket.recv``.
-        """
-        # Descriptors that a client may send along are dropped by the kernel, never opened here.
-        if not self.unread:
-            return self.sock.recv(most), False
-        packet, sent_ns = received(self.sock, most)
-        self.unread = max(0, self.unread - len(packet))
-        return packet, sent_ns < self.reset_ns
+    def was_queued(self, size: int) -> bool:
+        """Return whether a packet of so many bytes that has been received lay there when a reset was seen."""
+        was_queued = self.queued_bytes > 0
+        self.queued_bytes = max(0, self.queued_bytes - size) if size else 0
+        return was_queued
 
     def hear(self, now_ns: int) -> None:
         """Note that a packet of the client has come [ns, CLOCK_MONOTONIC]."""
@@ -194,7 +189,7 @@ class Wait:
         what: the request in words.
         deadline_ns: when it times out, None = never.
         ready: asked every tick; answers with (value,) when done, None while not; raises OSError to refuse.
-        channels: axes it depends on: dropped buffers end it.
+        channels: axes that it depends on, or is for: when they are stopped, it ends.
         cancelled: undoes what the wait has begun.
         looks: it changes nothing, it only waits for what readings show.
         on_events: it is not ready before an event of the bank, or another request.
@@ -336,14 +331,9 @@ class Waits:
         self.end_where(lambda w: w.handle.block is block, errno_, text)
 
     def end_axes(self, block: AnyBlock, axes: Iterable[int], errno_: int, text: str) -> None:
-        """End the waits for motion of some axes."""
+        """End the waits for motion of some axes, and the writes to them that are not in the buffers yet."""
         ours = {int(a) for a in axes}
         self.end_where(lambda w: w.handle.block is block and not ours.isdisjoint(w.channels), errno_, text)
-        # A write that waits for room must not be taken after its axes were stopped.
-        self.end_where(
-            lambda w: w.handle.block is block and w.cancelled is not None and not ours.isdisjoint(w.handle.axes),
-            errno_, text,
-        )  # fmt: skip
 
     def forget(self, handle: Handle) -> None:
         """Drop the waits of a handle that is gone."""

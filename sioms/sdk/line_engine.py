@@ -277,6 +277,13 @@ class LineEngine(Connected):
         yield from noting(steps, note) if isinstance(block, BinaryBlock) else steps
         note()
 
+    def drop_writes(self, block: AnyBlock, masks: Mapping[int, int]) -> None:
+        """Let no write go on that is on its way to these outputs: of each channel these bits, -1: all."""
+        for write in self._writes:
+            write.is_void |= write.block is block and any(
+                change.mask & masks.get(channel, 0) for channel, change in write.changes.items()
+            )
+
     def make_safe(self, block: AnyBlock) -> None:
         """Send the safe values that are wanted, ahead of everything but other stops; one message of each block is on
         its way.
@@ -329,8 +336,6 @@ class LineEngine(Connected):
     def stop(self, blocks: Sequence[AnyBlock]) -> None:
         """Send what the banks have been told: their stops overtake everything else on the line."""
         for block in blocks:
-            for write in self._writes:
-                write.is_void |= write.block is block
             self.commands_written(block)
 
     def is_quiet(self) -> bool:

@@ -147,16 +147,20 @@ def _axis_request(
             raise
     match request:
         case Request.WAIT_UNTIL_IDLE:
-            if bank.is_idle(axes) and not handle.writing:
+            block, channels = handle.block, frozenset(axes.tolist())
+
+            def is_written() -> bool:
+                return all(channels.isdisjoint(write.axes) for write in handle.writing)
+
+            if bank.is_idle(axes) and is_written():
                 if not service.engine.publishes:  # it may have learned so since the last publication
                     service.effects.note()
                 return None
-            block, channels = handle.block, frozenset(axes.tolist())
             service.waits.add(
                 Wait(
                     handle, number, what, service.loop.deadline(timeout_s),
-                    lambda: (None,) if not handle.writing and service.waits.is_idle(block, channels) else None,
-                    channels, looks=True, on_events=not handle.writing,
+                    lambda: (None,) if is_written() and service.waits.is_idle(block, channels) else None,
+                    channels, looks=True, on_events=is_written(),
                 )
             )  # fmt: skip
             return LATER
@@ -203,9 +207,11 @@ def _calibrate(handle: Handle, argument: Any, what: str) -> None:
     """Give axes the positions that they are to have; those with None keep theirs."""
     asked = argument if isinstance(argument, list) else [argument]
     rows = [row for row, position in enumerate(asked) if position is not None]
+    count = len(handle.channels)
+    if argument is None or len(asked) != count:
+        given = 0 if argument is None else len(asked)
+        raise _refuse(errno.EINVAL, f"{what}: {given} values of position; want {count}, none to keep one")
     positions = _numbers([asked[row] for row in rows], len(rows), what, "position")
-    if len(asked) != len(handle.channels):
-        raise _refuse(errno.EINVAL, f"{what}: {len(asked)} values of position; want {len(handle.channels)}")
     if rows:
         handle.block.bank.calibrate(handle.channels[rows], np.array(positions))  # type: ignore[union-attr]
 
@@ -231,7 +237,7 @@ def _synch(service: Service, handle: Handle, number: int, argument: Any, timeout
     if behind.has_turn():
         return start()
     deadline_ns = service.loop.deadline(timeout_s)
-    service.waits.add(Wait(handle, number, what, deadline_ns, behind.ready, frozenset(), behind.leave))
+    service.waits.add(Wait(handle, number, what, deadline_ns, behind.ready, behind.axes, behind.leave))
     handle.writing.append(behind)
     return LATER
 

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from contextlib import suppress
 
 _libc = ctypes.CDLL(None, use_errno=True)
-_TFD_CLOEXEC, _TFD_NONBLOCK, _TFD_TIMER_ABSTIME = 0o2000000, 0o4000, 1
+_TFD_CLOEXEC, _TFD_NONBLOCK, _TFD_TIMER_ABSTIME, _TFD_TIMER_CANCEL_ON_SET = 0o2000000, 0o4000, 1, 2
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _IN_MODIFY, _IN_ATTRIB = 0x02, 0x04
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29
@@ -62,6 +62,38 @@ class TimerFd:
             return int.from_bytes(os.read(self.fd, 8), "little")
         except BlockingIOError:
             return 0
+
+    def close(self) -> None:
+        """Release the descriptor."""
+        os.close(self.fd)
+
+
+class ClockChanges:
+    """Tells whether CLOCK_REALTIME has been set: what makes it jump, not what makes it faster (timerfd_create(2)).
+
+    Raises:
+        OSError: there are no descriptors left.
+
+    Concurrency: one thread.
+    """
+
+    def __init__(self) -> None:
+        self.fd: int = _libc.timerfd_create(time.CLOCK_REALTIME, _TFD_CLOEXEC | _TFD_NONBLOCK)
+        never = _Itimerspec(value=_Timespec(sec=1 << 40))
+        how = _TFD_TIMER_ABSTIME | _TFD_TIMER_CANCEL_ON_SET
+        if self.fd < 0 or _libc.timerfd_settime(self.fd, how, ctypes.byref(never), None):
+            raise OSError(ctypes.get_errno(), "watch the clock: timerfd failed")
+
+    def found(self) -> bool:
+        """Return whether it has been set since the last call."""
+        try:
+            os.read(self.fd, 8)
+        except BlockingIOError:
+            return False
+        except OSError as error:
+            if error.errno != errno.ECANCELED:
+                raise
+        return True
 
     def close(self) -> None:
         """Release the descriptor."""

@@ -256,6 +256,7 @@ class Runtime:
         self.watch(self._control.fileno(), self._control_readable)
         self.watch(self._timer.fd, self._on_timer)
         self.watch(self._line_timer.fd, self._on_line_timer)
+        self.watch(self.clients.timestamps.fd, self.clients.timestamps.look_at_clock)
         phase_ns = int(self._phase * self.period_ns)
         self._scheduled_ns = (time.monotonic_ns() - phase_ns) // self.period_ns * self.period_ns + phase_ns
         self._timer.set(self._scheduled_ns + 2 * self.period_ns - self._lead_ns, self.period_ns)
@@ -363,6 +364,7 @@ class Runtime:
             kept.let_go()
         for timer in (self._timer, self._line_timer):
             timer.close()
+        self.clients.close()
         self.stops.release()
         self._epoll.close()
         self._control.close()
@@ -693,13 +695,15 @@ class Runtime:
             case driver_verbs.NodeStop() | driver_verbs.NodeReset():
                 block, channels, bit, text, resets, *at_ns = message
                 self.stops.heed()  # a reset that came before it must not come after it
-                if resets != self.latch.resets:
-                    return  # the workcell has been reset since then: of all that, nothing is left
+                is_over = resets != self.latch.resets  # the workcell has been reset since then
                 if isinstance(message, driver_verbs.NodeStop):
-                    self.stops.stop_node(self.blocks[block], channels, bit, text)
+                    stop = self.stops.stop_in_passing if is_over else self.stops.stop_node
+                    stop(self.blocks[block], channels, bit, text)
+                    return
+                if is_over:
                     return
                 try:
-                    self.stops.reset_node(self.blocks[block], channels, bit, "reset", sent_ns=at_ns[0])
+                    self.stops.reset_node(self.blocks[block], channels, bit, "reset", at_ns[0])
                 except (OSError, CommandError) as error:
                     self.log("warning", str(error))
             case _:

@@ -31,6 +31,7 @@ from .engine import Engine
 from .handles import Handle, Waits
 from .outputs import WHOLE, Outputs, safe_of
 from .pages import Pages
+from .reset_times import ResetTimes
 
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
@@ -88,6 +89,7 @@ class Stops:
     Attributes:
         engine: of the device; set before the first tick.
         stopped: whether the workcell is stopped.
+        resets: when what was stopped was reset.
         latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit
             0 for channels without bits.
     """
@@ -101,6 +103,7 @@ class Stops:
         events: JournalWriter,
     ) -> None:  # fmt: skip
         self.stopped = False
+        self.resets = ResetTimes()
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._faulty: set[tuple[int, int]] = set()
         self._unsafe: dict[int, tuple[int, int]] = {}
@@ -113,9 +116,9 @@ class Stops:
         self._request = request
         self._journal = journal
         self._events = events
-        self._stops_again = False
         self._sources = [tuple(source) for source in sources]
         self._seen = (0, latch.resets, request.mark)
+        self._ended_ns = latch.ended_stop_ns
         self._orders = latch.orders
 
     @property
@@ -147,11 +150,6 @@ class Stops:
     def seen(self) -> tuple[int, int, int]:
         """What has been seen: the time of the workcell's stop [ns], how often it was reset, orders of the daemon."""
         return (*self._seen[:2], self._orders)
-
-    @property
-    def resets_seen(self) -> int:
-        """How many resets of the workcell have been seen."""
-        return self._seen[1]
 
     @property
     def seen_request(self) -> Mark:
@@ -189,17 +187,17 @@ class Stops:
         mark, fresh = self.latch_request()
         stopped_ns, resets = latch.stopped_ns, latch.resets
         self._seen = (stopped_ns, resets, mark)
-        if resets != seen_resets:
-            self._outdate(latch.reset_ns)
-        if (stopped_ns and stopped_ns != seen_stop) or resets != seen_resets:
-            self._stops_again, self.stopped = self.stopped and not stopped_ns, True
+        is_reset, is_missed = resets != seen_resets, False
+        if is_reset:
+            is_missed = self._note_workcell_reset(seen_stop)
+        if is_missed or (stopped_ns and stopped_ns != seen_stop):
+            self.stopped = True
             self.safe_stop(_emergency_stop_by(self.source))
-            self._stops_again = False
         if fresh:
             if stopped_ns:  # also by another driver, which may not have come to note it
                 self._note(workcell_entry(latch.source, stop=True, latched_ns=stopped_ns))
             self._request.take(mark)
-        if not stopped_ns and self.stopped:
+        if not stopped_ns and (self.stopped or is_reset):
             self._effects.note()
             self.stopped = False
             self.latched_outputs.clear()
@@ -208,12 +206,35 @@ class Stops:
                 if isinstance(block, AxisBlock):
                     self._reset_axes(block, range(block.n))
 
-    def _outdate(self, reset_ns: int, block: AnyBlock | None = None, channels: Iterable[int] = ()) -> None:
-        """Let nothing be taken that clients have sent to channels of a block, or to the device, before a reset."""
-        reset = set(channels)
+    def _note_workcell_reset(self, seen_stop_ns: int) -> bool:
+        """Note that the workcell has been reset; return whether that has ended a stop that was not seen."""
+        latch, before_ns = self._latch, self._ended_ns
+        self._ended_ns = ended_ns = latch.ended_stop_ns
+        if ended_ns != before_ns:
+            self.resets.note_all(latch.reset_ns)
+            for handle in self._handles.values():
+                handle.note_reset()
+        else:  # the workcell was not stopped: of what its nodes are
+            for block in self._blocks:
+                self._note_reset(block, self._stopped_of(block, range(block.n), -1), latch.reset_ns)
+        return ended_ns not in (before_ns, seen_stop_ns)
+
+    def _note_reset(self, block: AnyBlock, stopped: Sequence[tuple[int, int]], at_ns: int, by: int = 0) -> None:
+        """Note when parts of a block, that are stopped or in fault, were reset; see ``ResetTimes.note``."""
+        if not stopped:
+            return
+        self.resets.note(block, stopped, at_ns, by)
+        reset = {channel for channel, _ in stopped}
         for handle in self._handles.values():
-            if block is None or (handle.block is block and not reset.isdisjoint(handle.axes)):
-                handle.outdate(reset_ns)
+            if handle.block is block and not reset.isdisjoint(handle.axes) and handle.number != by:
+                handle.note_reset()
+
+    def _stopped_of(self, block: AnyBlock, channels: Iterable[int], bit: int) -> list[tuple[int, int]]:
+        """Return which parts of some channels are stopped or in fault, by themselves."""
+        if isinstance(block, AxisBlock):
+            return [(int(axis), 0) for axis in channels if block.bank.is_latched(int(axis))]
+        parts = (part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width))
+        return [part for part in parts if (id(block), *part) in self.latched_outputs]
 
     def look_at_inputs(self) -> None:
         """Stop the workcell when an input that is to stop it reads so."""
@@ -234,19 +255,19 @@ class Stops:
         """Stop axes and make outputs safe; every stop of this process is this one.
 
         The order, which docs/decisions/0176-one-safe-stop.md explains: banks, what is under way after a failure, the
-        stops of the device, its outputs, the requests that wait, the events of the banks. Each is done whatever became
-        of those before.
+        stops of the device, the writes on their way to its outputs, the outputs, the requests that wait, the events of
+        the banks. Each is done whatever became of those before.
 
         Args:
             reason: how and why.
-            parts: what stops; None: the whole device, and no write that is under way to it goes on.
+            parts: what stops; None: the whole device.
 
         Raises:
             Exception: the first that one of them has raised, when all have been done.
         """
         engine = self.engine
         whole = [(block, range(block.n), -1) for block in self._blocks] if parts is None else parts
-        blocks = [block for block, _, _ in whole if parts is None or isinstance(block, AxisBlock)]
+        axes = [block for block, _, _ in whole if isinstance(block, AxisBlock)]
         self._effects.note()
         steps: list[Callable[[], None]] = [partial(self._stop_axes, reason, whole)]
         if reason.stop is Stop.FAILURE:
@@ -254,8 +275,9 @@ class Stops:
         if reason.stop is Stop.LOSS:
             steps.append(partial(self._outputs.forget, [block for block, _, _ in whole]))
         else:
-            if blocks:
-                steps.append(partial(engine.stop, blocks))
+            if axes:
+                steps.append(partial(engine.stop, axes))
+            steps += [partial(self._drop_writes, *part) for part in whole]
             steps += [partial(self.make_safe, *part) for part in whole]
         if reason.errno:  # before the events of the banks would: these know who stopped
             steps.append(partial(self._end_waits, reason, whole))
@@ -267,8 +289,7 @@ class Stops:
             except Exception as error:  # nothing may keep the others from being stopped
                 failures.append(error)
         told = [] if parts is None else [[b.spec.name, [int(c) for c in channels], bit] for b, channels, bit in parts]
-        if not self._stops_again:  # before a reset what is stopped already is stopped once more
-            self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, told)
+        self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, told)
         if failures:
             raise failures[0]
 
@@ -336,31 +357,45 @@ class Stops:
                     self.latched_outputs[id(block), *part] = source
         self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
 
+    def stop_in_passing(self, block: AnyBlock, channels: Any, bit: int, source: str) -> None:
+        """Carry out an emergency stop, as ``stop_node``, that a reset of the workcell has ended before it was heard of:
+        what moves stops, what was sent before is not taken, and nothing stays latched that was not before.
+        """
+        before = set(self._stopped_of(block, channels, bit))
+        self.stop_node(block, channels, bit, source)
+        stopped = [part for part in self._stopped_of(block, channels, bit) if part not in before]
+        self._note_reset(block, stopped, self._latch.reset_ns)
+        self._clear(block, stopped)
+
     def reset_node(
-        self, block: AnyBlock, channels: Any, bit: int, what: str, until_ns: int | None = None, sent_ns: int = 0
+        self, block: AnyBlock, channels: Any, bit: int, what: str, at_ns: int, until_ns: int | None = None, by: int = 0
     ) -> None:  # fmt: skip
         """Clear the latched stop and faults of some channels, or the stop of one bit of them.
 
         Args:
             block, channels, bit: what is reset.
             what: in words.
+            at_ns: when that was asked for [ns, CLOCK_MONOTONIC].
             until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
-            sent_ns: when the reset was sent; 0: now.
+            by: number of the handle that asks for it; 0: none.
 
         Raises:
             OSError: as ``check_reset``.
         """
         self.check_reset(block, channels, what, until_ns)
         self._effects.note()
-        now_ns, reset = time.monotonic_ns(), [int(c) for c in channels]
-        self._events.note(Note.RESET, now_ns, block.spec.name, reset)
-        self._outdate(sent_ns or now_ns, block, reset)
+        self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
+        parts = [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
+        self._note_reset(block, self._stopped_of(block, channels, bit), at_ns, by)
+        self._clear(block, parts)
+
+    def _clear(self, block: AnyBlock, parts: Iterable[tuple[int, int]]) -> None:
+        """Clear the stop and the faults of parts of a block."""
         if isinstance(block, AxisBlock):
-            self._reset_axes(block, channels)
+            self._reset_axes(block, [axis for axis, _ in parts])
             return
-        for channel in channels:
-            for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
-                self.latched_outputs.pop((id(block), *part), None)
+        for part in parts:
+            self.latched_outputs.pop((id(block), *part), None)
 
     def check_reset(self, block: AnyBlock, channels: Any, what: str, until_ns: int | None) -> None:
         """Refuse a reset of some channels that cannot be.
@@ -394,10 +429,9 @@ class Stops:
         self.check_reset(handle.block, handle.channels, what, until_ns)
         self.note_node(handle, handle.who, stop=False)
         heed()
-        before = handle.unread, handle.reset_ns
         try:
-            self.reset_node(handle.block, handle.channels, handle.bit, what, until_ns)
-            handle.unread, handle.reset_ns = before  # what comes behind its own request was sent after it
+            now_ns = time.monotonic_ns()
+            self.reset_node(handle.block, handle.channels, handle.bit, what, now_ns, until_ns, handle.number)
         except OSError:
             self.note_node(handle, f"a stop that came during a reset by {handle.who}", stop=True)
             raise
@@ -453,6 +487,10 @@ class Stops:
             self._log("error", f"a stop or reset is not kept beyond this process: {error.strerror}")
 
     # --- outputs ---------------------------------------------------------------------------------
+
+    def _drop_writes(self, block: AnyBlock, channels: Any, bit: int) -> None:
+        if not isinstance(block, AxisBlock):
+            self.engine.drop_writes(block, dict.fromkeys(map(int, channels), 1 << bit if bit >= 0 else -1))
 
     def make_safe(self, block: AnyBlock, channels: Any, bit: int = -1) -> None:
         """Want the safe values of output channels, or of one bit, until the device has them; those without one keep the

@@ -114,6 +114,9 @@ class StreamEngine(Connected):
         """Refuse: a stream has no outputs."""
         raise OSError(errno.EBADF, f"write {block.spec.name}: this device only sends")
 
+    def drop_writes(self, block: AnyBlock, masks: Mapping[int, int]) -> None:
+        """Nothing is on its way: a stream has no outputs."""
+
     def make_safe(self, block: AnyBlock) -> None:
         """Nothing: a stream has no outputs."""
 

@@ -96,6 +96,9 @@ class TickEngine:
         self._write(block, changes)
         return self._loop.tick
 
+    def drop_writes(self, block: AnyBlock, masks: Mapping[int, int]) -> None:
+        """Nothing is on its way: the driver has been handed every write."""
+
     def make_safe(self, block: AnyBlock) -> None:
         """Hand the safe values that are wanted to the driver; what it refuses is tried again after the next tick."""
         changes = self._outputs.unsent(block)

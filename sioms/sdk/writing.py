@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.motion import CommandError, Judged, Judgement
+from sioms.protocol import verbs
 from sioms.protocol.flags import NodeClass, WriteFlag
 from sioms.protocol.records import WRITE_STRUCT, numpy_dtype
 
@@ -76,6 +77,30 @@ def write(service: Service, handle: Handle, number: int, flags: int, timeout_s: 
     return service.engine.write_outputs(handle, number, block, changes)
 
 
+def masks_of(handle: Handle, records: NDArray[Any]) -> dict[int, int]:
+    """Return which channels of the block records are for, and which bits of each (-1: all); wrong ones are left out."""
+    masks: dict[int, int] = {}
+    names = records.dtype.names or ()
+    of_channels = records[names[0]]
+    if "mask" in names and handle.bit < 0:
+        asked = [*zip(of_channels.tolist(), records["mask"].tolist(), strict=True)]
+    else:
+        asked = [(index, 1 << handle.bit if handle.bit >= 0 else -1) for index in np.unique(of_channels).tolist()]
+    for index, mask in asked:
+        if 0 <= index < len(handle.axes):
+            masks[handle.axes[index]] = masks.get(handle.axes[index], 0) | (mask or -1)
+    return masks
+
+
+def concerned(handle: Handle, message: verbs.Message) -> dict[int, int]:
+    """Return what a message is for, as ``masks_of``."""
+    if isinstance(message, verbs.Write | verbs.Part):
+        dtype = _DTYPE[handle.block.spec.node_class]
+        if not len(message.records) % dtype.itemsize:
+            return masks_of(handle, np.frombuffer(message.records, dtype))
+    return dict.fromkeys(handle.axes, 1 << handle.bit if handle.bit >= 0 else -1)
+
+
 def take_plain(service: Service, handle: Handle, flags: int, data: bytes, now_ns: int) -> None:
     """Take records that steps have found plain and good, and have acknowledged.
 
@@ -115,9 +140,10 @@ class AxesWrite:
     Attributes:
         lacks_room: whether it has been found to need more room than there is.
         replaces: whether it replaces the buffer.
+        axes: of the block.
     """
 
-    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_service", "lacks_room", "replaces")
+    __slots__ = ("_handle", "_judgement", "_patient", "_records", "_service", "axes", "lacks_room", "replaces")
 
     def __init__(self, service: Service, handle: Handle, records: NDArray[Any], replace: bool, patient: bool) -> None:
         self.lacks_room = False
@@ -127,6 +153,7 @@ class AxesWrite:
         self.replaces = replace
         self._patient = patient
         self._judgement: Judgement | None = None
+        self.axes = frozenset(masks_of(handle, records))
 
     def ready(self) -> tuple[int] | None:
         """Go on while the tick leaves time; return (tick,) when all is in the buffers.
@@ -213,10 +240,11 @@ class Behind:
         act: does it.
     """
 
-    __slots__ = ("_act", "_handle", "lacks_room", "replaces")
+    __slots__ = ("_act", "_handle", "axes", "lacks_room", "replaces")
 
     def __init__(self, handle: Handle, act: Callable[[], int]) -> None:
         self.lacks_room = self.replaces = False
+        self.axes = frozenset(handle.axes)
         self._handle, self._act = handle, act
 
     def has_turn(self) -> bool:
@@ -275,7 +303,7 @@ def _write_axes(
         return service.loop.tick
     limit_ns = service.loop.deadline(timeout_s) if patient else None
     what = f"write {handle.node}"
-    service.waits.add(Wait(handle, number, what, limit_ns, write.ready, frozenset(), write.leave))
+    service.waits.add(Wait(handle, number, what, limit_ns, write.ready, write.axes, write.leave))
     handle.writing.append(write)
     return LATER
 

@@ -214,7 +214,7 @@ def test_what_was_sent_before_a_stop_is_not_taken_after_its_reset(start_daemon: 
         finally:
             os.kill(pid, signal.SIGCONT)
         for call in early:
-            with raises(errno.ECANCELED, "mod0", "was reset after this was sent"):
+            with raises(errno.ECANCELED, "mod0", "sent before the last reset"):
                 node._channel.wait(call.number, call)
         node._channel.wait(late.number, late)
         wait_for(lambda: node.read().velocity[0] > 0.05, "what was sent after the reset")

@@ -45,7 +45,7 @@ def _stop(process: Process, chance: random.Random) -> None:
 
 
 def _reset(process: Process, chance: random.Random) -> None:
-    process.latch.reset()
+    process.latch.reset(CLOCK.now_ns)
     for device in process.devices:
         if chance.random() < 0.8:
             process.order(device, DriverVerb.STOP_CHANGED)

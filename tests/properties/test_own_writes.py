@@ -219,7 +219,7 @@ def _axis_acts(
     def reset_all() -> None:
         state = promises.withdraw("latch", "place")
         if world.latch.stopped_ns:
-            world.latch.reset(world.runtime.stops._seen[2])
+            world.latch.reset(CLOCK(), world.runtime.stops._seen[2])
             shown.acknowledged_by_daemon(time.monotonic_ns())
             promises.make(state, "workcell reset", latch=lambda s: not s.status[0] & STOPPED)(None)
 

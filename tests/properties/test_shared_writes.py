@@ -18,7 +18,9 @@ import msgspec
 import pytest
 from beat_rig import CLOCK, Device, Process, processes
 from own_writes_rig import SEED
+from sent_rig import SentTimes
 
+from sioms.descriptors import enable_timestamps
 from sioms.drivers.sim.axes import SimAxes
 from sioms.motion.axis_step import HOLD, RATE
 from sioms.protocol.driver_verbs import Attach, DriverVerb
@@ -31,6 +33,7 @@ TRIALS = int(os.environ.get("SIOMS_SHARED_WRITES", "3"))
 """With each set of devices."""
 AXIS = {"name": "a", "velocity_max": 1.0, "acceleration_max": 50.0, "force_max": 200.0, "motor": {"mass": 1.0}}
 AXIS["bandwidth_hz"] = 5.0
+SENT = SentTimes(lambda: CLOCK.now_ns)
 
 
 @dataclass
@@ -64,6 +67,7 @@ class World:
         self.handles += 1
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)
+        enable_timestamps(theirs)
         readable, wake = os.pipe2(os.O_NONBLOCK)
         os.close(readable)
         access = int(Access.READ | Access.WRITE)
@@ -85,6 +89,7 @@ class World:
             columns |= {"time": 1e3, "control_mode": int(mode | ControlMode.SPECIFIED_TIME)}
         record = AXIS_WRITE.pack(*(dict.fromkeys(WRITE[NodeClass.AXIS], 0) | columns).values())
         client.sent[client.number] = velocity, self.is_stopped
+        SENT.note()
         client.sock.send(Write(1, 0.0, record).packed(client.number))
 
     def hear(self) -> None:
@@ -127,7 +132,7 @@ class World:
             self.calm()
             for client in self.clients:
                 assert client.device.driver.bank.rows["status"][0] & AxisStatus.EMERGENCY_STOP
-            self.process.latch.reset(self.process.devices[0].runtime.stops.seen_request)
+            self.process.latch.reset(CLOCK.now_ns, self.process.devices[0].runtime.stops.seen_request)
             for device in self.process.devices:
                 self.process.order(device, DriverVerb.STOP_CHANGED)
             self.is_stopped = False
@@ -196,7 +201,8 @@ def test_what_is_acknowledged_holds_and_nothing_is_taken_under_a_stop(hz: tuple[
     taken = served = 0
     for trial in range(TRIALS):
         chance = random.Random(trial + 100_000 * SEED)
-        with processes() as make:
+        with pytest.MonkeyPatch.context() as patch, processes() as make:
+            SENT.install(patch)
             world = World(make(hz, [chance.random() for _ in hz], SimAxes, _table), chance)
             try:
                 for _ in range(4):

@@ -43,7 +43,7 @@ def test_stops_resets_and_orders(end: int) -> None:
     latch._words[1] = latch._words[5] = end + AROUND[0] - 1
     for step in AROUND:
         assert latch.stop(end + step, "somebody") and latch.stopped_ns == end + step
-        latch.reset((end + step, end + step))
+        latch.reset(1, (end + step, end + step))
         latch.ordered()
         latch.daemon_alive(end + step)
         assert (latch.resets, latch.orders, latch.daemon_alive_ns) == (end + step,) * 3

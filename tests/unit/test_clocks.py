@@ -22,11 +22,12 @@ SHOWN = {
     "sioms/check/other_clock.py": "what stated uncertainties of UTC are compared with",
     "sioms/client/certificates.py": "whether a certificate has expired, to say so; TLS judges by itself",
     "sioms/client/wall.py": "the wall clock of a reading, for who asks for it",
-    "sioms/dated.py": "dates of the kernel; where that clock has been set, a packet counts as old and is refused",
     "sioms/gateway/certificates.py": "from when until when a certificate is valid",
     "sioms/reconcile/live/watch.py": "since when an axis drifts, as text",
     "sioms/reconcile/report/watch.py": "since when an axis drifts, as text",
     "sioms/recording": "the names and the beginning of recordings",
+    "sioms/sdk/rt.py": "whether the clock has been set",
+    "sioms/sdk/timestamps.py": "the age of packets; where the clock has been set, they are refused",
     "sioms/sdk/stops.py": "since when something has been stopped",
     "tools": "what a person reads",
 }

@@ -25,7 +25,7 @@ def test_the_latch_holds_its_first_stop_until_reset() -> None:
     assert latch.stopped_ns == 0 and latch.source == ""
     assert latch.stop(5, "eva") and not other.stop(6, "tom")
     assert (other.stopped_ns, other.source, other.resets) == (5, "eva", 0)
-    latch.reset()
+    latch.reset(1)
     assert (other.stopped_ns, other.resets) == (0, 1)
     assert other.stop(7, "ö" * 300) and 100 < len(latch.source) <= 128
     latch.daemon_alive(9)
@@ -40,7 +40,7 @@ def test_a_driver_that_latches_at_the_same_time_does_not_undo_the_named_reason()
     memory[:8] = bytes(8)  # the driver has looked just before the daemon latched
     assert driver.stop(6, "pid 7, through the stop-request page")
     assert driver.source == "eva: smoke"
-    daemon.reset()
+    daemon.reset(1)
     assert driver.stop(8, "input light") and daemon.source == "input light"
 
 
@@ -48,7 +48,7 @@ def test_a_stop_and_reset_between_two_looks_shows() -> None:
     latch = Latch(memoryview(bytearray(LATCH_SIZE)))
     before = (latch.stopped_ns, latch.resets)
     latch.stop(5, "x")
-    latch.reset()
+    latch.reset(1)
     assert (latch.stopped_ns, latch.resets) != before
 
 
@@ -166,7 +166,7 @@ def test_a_reset_tells_which_request_it_has_answered(request_file: StopRequest) 
     latch = Latch(memoryview(bytearray(LATCH_SIZE)))
     request_file.request(1000, 4711)
     latch.stop(1000, "a client")
-    latch.reset(request_file.mark)
+    latch.reset(1, request_file.mark)
     assert latch.stopped_ns == 0 and latch.answered_request == request_file.mark
     request_file.request(2000, 4711)
     assert latch.answered_request != request_file.mark

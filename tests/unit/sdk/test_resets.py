@@ -88,13 +88,3 @@ def test_what_is_no_instant_is_refused(world: World, until_ns: Any) -> None:
     _stop(world)
     assert _reset(client, until_ns) == errno.EINVAL
     assert _is_latched(world)
-
-
-def test_a_reset_outdates_what_others_have_sent_and_not_what_follows_it(world: World) -> None:
-    owner, eva = world.open(0, [0], exclusive=True), world.open(0, [0], exclusive=False)
-    theirs, hers = world.runtime.clients.handles.values()
-    _stop(world)
-    for client in (owner, eva):
-        client.channel.send(client.node._ioctl(Request.GET_LIMITS, None, None))
-    world.runtime.stops.reset_by(hers, "reset", None, world.runtime.heed)
-    assert theirs.unread > 0 and theirs.reset_ns and not hers.unread

@@ -33,11 +33,12 @@ class Device:
         self.axes = AxisBlock(BlockSpec("", NodeClass.AXIS, axes), bank)
         self.port = BinaryBlock(BlockSpec("out", NodeClass.BINARY, port, writable=True, safe=(0,)))
         engine: Any = SimpleNamespace(
-            stop=self.note("device stops"), make_safe=self.note("outputs"), recover=self.note("recover")
-        )
+            stop=self.note("device stops"), make_safe=self.note("outputs"), recover=self.note("recover"),
+            drop_writes=self.note("writes"),
+        )  # fmt: skip
         outputs: Any = SimpleNamespace(want=lambda *_: None, forget=self.note("outputs are forgotten"))
         waits: Any = SimpleNamespace(end_axes=self.note("waits"), end_block=self.note("all waits"))
-        latch: Any = SimpleNamespace(resets=0, orders=0)
+        latch: Any = SimpleNamespace(resets=0, orders=0, ended_stop_ns=0)
         nothing: Any = SimpleNamespace(mark=0)
         self.stops = Stops(
             "dev",
@@ -71,10 +72,10 @@ class Device:
 @pytest.mark.parametrize(
     ("stop", "number", "wanted"),
     [
-        (Stop.CONTROLLED, 0, "stop, device stops, outputs, events"),
-        (Stop.CONTROLLED, errno.ECANCELED, "stop, device stops, outputs, waits, events"),
-        (Stop.EMERGENCY, errno.ECANCELED, "emergency_stop, device stops, outputs, waits, events"),
-        (Stop.FAILURE, 0, "emergency_stop, recover, device stops, outputs, events"),
+        (Stop.CONTROLLED, 0, "stop, device stops, writes, outputs, events"),
+        (Stop.CONTROLLED, errno.ECANCELED, "stop, device stops, writes, outputs, waits, events"),
+        (Stop.EMERGENCY, errno.ECANCELED, "emergency_stop, device stops, writes, outputs, waits, events"),
+        (Stop.FAILURE, 0, "emergency_stop, recover, device stops, writes, outputs, events"),
         (Stop.LOSS, errno.EIO, "fault, outputs are forgotten, all waits, all waits, events"),
     ],
 )
@@ -87,19 +88,19 @@ def test_the_order_is_one(stop: Stop, number: int, wanted: str) -> None:
     assert ", ".join(whole.told) == wanted
 
 
-@pytest.mark.parametrize("failing", ["recover", "device stops", "outputs", "events"])
+@pytest.mark.parametrize("failing", ["recover", "device stops", "writes", "outputs", "events"])
 def test_a_step_that_fails_keeps_no_other_from_being_done(failing: str) -> None:
     device = Device(failing)
     with pytest.raises(RuntimeError, match=failing):
         device.stops.safe_stop(Reason(Stop.FAILURE, "why"))
-    assert ", ".join(device.told) == "emergency_stop, recover, device stops, outputs, events"
+    assert ", ".join(device.told) == "emergency_stop, recover, device stops, writes, outputs, events"
 
 
 def test_of_an_output_only_what_is_asked_for_is_stopped() -> None:
     """Writes to other bits of the port, that are under way, go on."""
     device = Device()
     device.stops.safe_stop(Reason(Stop.CONTROLLED, "why"), [(device.port, [0], 2)])
-    assert device.told == ["outputs", "events"]
+    assert device.told == ["writes", "outputs", "events"]
 
 
 def test_nothing_stops_past_it() -> None:

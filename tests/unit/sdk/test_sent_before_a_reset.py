@@ -1,0 +1,325 @@
+"""What was sent before the reset of what it is for is not carried out after it; everything else is."""
+
+from __future__ import annotations
+
+import errno
+import random
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+from own_writes_rig import CLOCK, SENT, Client, Device, OnLine, World, own_time
+
+from sioms.drivers.sim.axes import SimAxes
+from sioms.drivers.sim.io import SimIo
+from sioms.protocol.driver_verbs import DriverVerb
+from sioms.protocol.flags import ControlMode, NodeClass, Request
+from sioms.protocol.records import AXIS_WRITE, WRITE, WRITE_STRUCT
+from sioms.protocol.verbs import Part, Write
+
+AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "motor": {"mass": 1.0}, "force_max": 60.0}
+LATER_NS = 1_000_000
+
+
+def _world(driver: Any, table: dict[str, Any], device: Device | None = None) -> Iterator[World]:
+    made: list[World] = []
+    with own_time(made):
+        made.append(World.__new__(World))
+        made[0].__init__(driver, table, random.Random(1), device)  # type: ignore[misc]
+        yield made[0]
+        made[0].close()
+
+
+@pytest.fixture
+def axes() -> Iterator[World]:
+    yield from _world(SimAxes, {"axis": [{"name": "x", **AXIS}, {"name": "y", **AXIS}]})
+
+
+@pytest.fixture
+def port() -> Iterator[World]:
+    yield from _world(SimIo, {"outputs": 8, "safe": 0})
+
+
+@pytest.fixture
+def line() -> Iterator[World]:
+    yield from _world(OnLine, {}, Device(random.Random(1)))
+
+
+def jog(axis: int, velocity: float = 0.1) -> bytes:
+    """Return the record of a move at a velocity."""
+    fields = {"axis": axis, "control_mode": int(ControlMode.VELOCITY), "velocity": velocity}
+    return AXIS_WRITE.pack(*(fields.get(name, 0) for name in WRITE[NodeClass.AXIS]))
+
+
+class Sender:
+    """A client, and what its requests have been answered, in their order."""
+
+    def __init__(self, world: World, client: Client) -> None:
+        self.world, self.client = world, client
+        self.answers: list[Any] = []
+
+    def post(self, call: Any) -> None:
+        CLOCK.now_ns += LATER_NS
+        self.client.post(call, self.answers.append)
+
+    def jog(self, axis: int = 0, velocity: float = 0.1) -> None:
+        self.post(self.client.node._write(jog(axis, velocity), 0.0, False))
+
+    def set_bits(self, bits: int, mask: int) -> None:
+        self.post(self.client.node._write(WRITE_STRUCT[NodeClass.BINARY].pack(0, 0, bits, mask), 0.0, False))
+
+    def reset(self) -> None:
+        self.post(self.client.node._ioctl(Request.RESET, None, None))
+
+    def served(self) -> list[int | None]:
+        """Let the driver come to what was sent; return the errnos of the answers, None: done."""
+        CLOCK.now_ns += LATER_NS
+        handle = self.world.runtime.clients.handles[self.client.node.handle]
+        for _ in range(8):
+            self.world.runtime.clients._readable(handle)
+        self.client.take()
+        return [answer.errno if isinstance(answer, OSError) else None for answer in self.answers]
+
+
+def _order(world: World, verb: DriverVerb, channels: list[int], bit: int = -1) -> None:
+    CLOCK.now_ns += LATER_NS
+    more = [CLOCK()] if verb is DriverVerb.NODE_RESET else []
+    world.order(verb, 0, channels, bit, "eva", world.latch.resets, *more)
+
+
+def _stop_and_reset(world: World, channels: list[int], bit: int = -1) -> None:
+    _order(world, DriverVerb.NODE_STOP, channels, bit)
+    _order(world, DriverVerb.NODE_RESET, channels, bit)
+
+
+def test_a_node_that_was_stopped_and_reset_takes_nothing_of_before(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    owner.jog()
+    _stop_and_reset(axes, [0])
+    owner.jog()
+    assert owner.served() == [errno.ECANCELED, None]
+
+
+def test_an_axis_that_was_not_stopped_takes_what_is_for_it_alone(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    owner.jog(1)
+    owner.jog(0)
+    owner.post(owner.client.node._ioctl(Request.HOME, 1, None))
+    _stop_and_reset(axes, [0])
+    assert owner.served() == [None, errno.ECANCELED, errno.ECANCELED], "HOME is judged by all axes of its node"
+
+
+def test_a_reset_of_what_was_not_stopped_is_in_nobodys_way(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.jog()
+    _order(axes, DriverVerb.NODE_RESET, [0])
+    owner.jog(velocity=0.0)
+    assert owner.served() == [None, None]
+
+
+def test_an_axis_in_fault_that_is_reset_counts_as_stopped(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.jog()
+    axes.runtime.blocks[0].bank.fault([0], "it jams", CLOCK())  # type: ignore[attr-defined]
+    _order(axes, DriverVerb.NODE_RESET, [0])
+    assert owner.served() == [errno.ECANCELED]
+
+
+def test_what_a_client_sends_behind_its_own_reset_is_taken(axes: World) -> None:
+    owner, eva = (Sender(axes, axes.open(0, [0], exclusive=exclusive)) for exclusive in (True, False))
+    _order(axes, DriverVerb.NODE_STOP, [0])
+    owner.reset()
+    owner.jog()
+    assert owner.served() == [None, None]
+    _order(axes, DriverVerb.NODE_STOP, [0])
+    owner.jog()
+    eva.reset()
+    assert eva.served() == [None]
+    assert owner.served()[2:] == [errno.ECANCELED]
+
+
+def test_own_resets_hide_no_later_ones_of_others(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    _order(axes, DriverVerb.NODE_STOP, [0])
+    owner.reset()
+    assert owner.served() == [None]
+    owner.jog()
+    _stop_and_reset(axes, [0])
+    assert owner.served()[1:] == [errno.ECANCELED]
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_the_workcell_takes_nothing_of_before_its_reset(axes: World, is_seen: bool) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.jog()
+    axes.latch.stop(CLOCK(), "eva")
+    if is_seen:
+        axes.runtime.heed()
+    CLOCK.now_ns += LATER_NS
+    axes.latch.reset(CLOCK())
+    owner.jog()
+    assert owner.served() == [errno.ECANCELED, None]
+
+
+def test_a_reset_of_a_workcell_that_was_not_stopped_changes_nothing(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.jog()
+    assert owner.served() == [None]
+    for _ in range(200):
+        axes.tick()
+    owner.jog(velocity=0.2)
+    axes.latch.reset(CLOCK())
+    assert owner.served() == [None, None]
+    for _ in range(200):
+        axes.tick()
+    rows = axes.runtime.blocks[0].bank.rows  # type: ignore[attr-defined]
+    assert rows["commanded_velocity"][0] == pytest.approx(0.2)
+
+
+@pytest.mark.parametrize("is_seen", [True, False])
+def test_a_reset_of_the_workcell_resets_a_node_that_alone_was_stopped(axes: World, is_seen: bool) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    _order(axes, DriverVerb.NODE_STOP, [0])
+    if is_seen:
+        axes.runtime.heed()
+    owner.jog(0)
+    owner.jog(1)
+    CLOCK.now_ns += LATER_NS
+    axes.latch.reset(CLOCK())
+    owner.jog(0)
+    assert owner.served() == [errno.ECANCELED, None, None]
+
+
+def test_a_stop_of_a_node_that_is_heard_of_after_the_reset_stops_what_moves(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    owner.jog(0)
+    owner.jog(1)
+    assert owner.served() == [None, None]
+    _order(axes, DriverVerb.NODE_STOP, [0])
+    axes.latch.reset(CLOCK())
+    for _ in range(500):
+        axes.tick()
+    rows = axes.runtime.blocks[0].bank.rows  # type: ignore[attr-defined]
+    assert rows["commanded_velocity"].tolist() == [0.0, pytest.approx(0.1)]
+    owner.jog(0)
+    assert owner.served()[2:] == [None], "it is not stopped any more"
+
+
+def test_a_second_stop_that_was_missed_behind_one_that_was_seen_stops_too(axes: World) -> None:
+    axes.latch.stop(CLOCK(), "eva")
+    axes.runtime.heed()
+    axes.latch.reset(CLOCK())
+    axes.runtime.heed()
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.jog()
+    assert owner.served() == [None]
+    axes.latch.stop(CLOCK(), "eva")
+    axes.latch.reset(CLOCK())
+    axes.latch.reset(CLOCK())
+    axes.runtime.heed()
+    for _ in range(500):
+        axes.tick()
+    assert axes.runtime.blocks[0].bank.rows["commanded_velocity"][0] == 0.0  # type: ignore[attr-defined]
+
+
+def test_a_client_that_the_driver_hears_of_only_after_the_reset_is_judged_too(axes: World) -> None:
+    early: list[Sender] = []
+
+    def act(client: Client) -> None:
+        early.append(Sender(axes, client))
+        early[0].jog()
+        axes.latch.stop(CLOCK(), "eva")
+        CLOCK.now_ns += LATER_NS
+        axes.latch.reset(CLOCK())
+        axes.runtime.heed()
+
+    axes.open(0, [0], exclusive=True, early=act)
+    early[0].jog()
+    assert early[0].served() == [errno.ECANCELED, None]
+
+
+def test_a_reset_that_is_seen_while_a_packet_is_being_served_is_not_missed(
+    axes: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    looks, heed = [0], axes.runtime.heed
+
+    def late() -> None:
+        looks[0] += 1
+        if looks[0] == 2:  # between the look before it is received and the look before it is done
+            _stop_and_reset(axes, [0])
+        heed()
+
+    owner.jog()
+    monkeypatch.setattr(axes.runtime, "heed", late)
+    assert owner.served() == [errno.ECANCELED]
+
+
+def test_stops_and_questions_of_before_are_served(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    for request in (Request.STOP, Request.GET_LIMITS, Request.EMERGENCY_STOP):
+        owner.post(owner.client.node._ioctl(request, None, None))
+    _stop_and_reset(axes, [0])
+    assert owner.served() == [None, None, None]
+
+
+@pytest.mark.parametrize("is_received", [True, False])
+def test_a_write_that_was_sent_in_part_is_refused_as_a_whole(axes: World, is_received: bool) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    number, sock = 900, owner.client.channel._sock
+    owner.client.pending[number] = owner.answers.append
+    SENT.note()
+    sock.send(Part(number, jog(0)).packed(0))
+    if is_received:
+        axes.runtime.clients._readable(axes.runtime.clients.handles[owner.client.node.handle])
+    _stop_and_reset(axes, [0])
+    CLOCK.now_ns += LATER_NS
+    SENT.note()
+    sock.send(Write(0, 0.0, jog(1)).packed(number))  # for the other axis, and behind the reset
+    owner.jog(1)
+    assert owner.served() == [errno.ECANCELED, None]
+
+
+def test_bits_that_were_not_stopped_take_what_was_sent(port: World) -> None:
+    owner = Sender(port, port.open(0, [0], exclusive=True))
+    owner.set_bits(0b0100, 0b0100)
+    owner.set_bits(0b1000, 0b1000)
+    owner.set_bits(0b0101, 0)
+    _stop_and_reset(port, [0], bit=3)
+    assert owner.served() == [None, errno.ECANCELED, errno.ECANCELED]
+    port.tick()
+    assert int(port.runtime.blocks[0].data[0]) == 0b0100  # type: ignore[attr-defined]
+
+
+def test_a_node_of_one_bit_is_judged_by_that_bit(port: World) -> None:
+    beside = Sender(port, port.open(0, [0], exclusive=True, bit=2))
+    same = Sender(port, port.open(0, [0], exclusive=True, bit=3))
+    for sender in (beside, same):
+        sender.set_bits(1, 0)
+    _stop_and_reset(port, [0], bit=3)
+    assert beside.served() == [None] and same.served() == [errno.ECANCELED]
+
+
+def test_a_write_that_waits_for_the_line_does_not_come_behind_the_stop_of_its_output(line: World) -> None:
+    """Though the output has no safe value; bits that are not stopped are written."""
+    block = 1
+    same, beside = (Sender(line, line.open(block, [0], exclusive=True, bit=bit)) for bit in (1, 2))
+    for sender in (same, beside):
+        sender.set_bits(1, 0)
+        assert sender.served() == [], "they wait for the line"
+    line.order(DriverVerb.NODE_STOP, block, [0], 1, "eva", line.latch.resets)
+    line.runtime.heed()
+    for _ in range(200):
+        line.turn(calm=True)
+    assert same.served() == [errno.ECANCELED] and beside.served() == [None]
+    assert line.device is not None and line.device.outputs == 0b100
+
+
+def test_a_client_that_leaves_takes_its_waiting_write_along(line: World) -> None:
+    owner = Sender(line, line.open(1, [0], exclusive=True))
+    owner.set_bits(0b11, 0)
+    assert owner.served() == []
+    line.close_node(owner.client)
+    for _ in range(200):
+        line.turn(calm=True)
+    assert line.device is not None and line.device.outputs == 0
