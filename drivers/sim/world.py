@@ -17,6 +17,10 @@ The stiffness of a mount lies between the axis and its finger, behind the axis's
 series. While an axis is not there the world stands still and its readings are invalid. A world that is killed takes
 what leans on it along: axes that carry a finger or have a ``load_node`` of it are in fault, fingers and force sensors
 read invalid. World and axes see each other late; a mount whose damping is too low for that is refused.
+
+No finger is ever put into the object. Where one stands in its place at the start, or comes back with its axis inside
+it, the platen is empty, which the log says: fingers meet nothing, and ``pose`` is flagged invalid. The object is laid
+where the configuration puts it as soon as no finger is there.
 """
 
 from __future__ import annotations
@@ -43,6 +47,8 @@ MountTable: Any = table_type(Mount)
 _CATCH_UP = 50
 """Ticks that the world goes on for at once; for what is later it stands still."""
 _INVALID = int(AnalogStatus.INVALID)
+_INTO_M = 5e-4
+"""How much deeper a finger whose axis was away may be in the object: brakes let a motor go on by less."""
 
 _POSE = (("x", "m"), ("y", "m"), ("angle", "rad"), ("vx", "m/s"), ("vy", "m/s"), ("spin", "rad/s"))
 _FINGER = (
@@ -177,14 +183,35 @@ class SimWorld(TickDriver):
             if self._world is None:
                 mounts = [from_table(Mount, finger.mount) for finger in self.settings.finger]
                 self._world = World(self._body, mounts, known, self.settings.object.pose)
+                self._keep_apart(self._world, [0.0] * len(known))
             elif self._missing:  # an axis that is back may be elsewhere
+                before = self._world.clearances()
                 self._world.shift(known)
+                self._keep_apart(self._world, [min(gap, 0.0) - _INTO_M for gap in before])
             elif elapsed_s > 0.0:
                 elapsed_s = min(elapsed_s, _CATCH_UP / self.settings.tick_hz)
                 self._world.command(known, elapsed_s)
                 self._world.advance(elapsed_s, math.ceil(elapsed_s / self.settings.step_s))
+            if self._world.lifted and min(self._world.clearances(self.settings.object.pose), default=0.0) >= 0.0:
+                self._world.lay(self.settings.object.pose)
+                self.kit.log("info", "no finger is where the object is configured to lie: it lies there now")
         self._missing = missing
         self._show(_INVALID if missing else 0)
+
+    def _keep_apart(self, world: World, least_m: Sequence[float]) -> None:
+        """Take the object off the platen where a finger is nearer to it than that; say which."""
+        inside = [
+            finger.name
+            for finger, gap, least in zip(self.settings.finger, world.clearances(), least_m, strict=True)
+            if gap < least
+        ]
+        if inside and not world.lifted:
+            world.lift()
+            self.kit.log(
+                "warning",
+                f"{', '.join(inside)} would be put into the object: the platen is empty until no finger is where the "
+                "object is configured to lie; want the fingers moved away from there",
+            )
 
     def _position(self, node: str, now_ns: int) -> float | None:
         if not node:
@@ -198,6 +225,8 @@ class SimWorld(TickDriver):
         world = self._world
         if world is None:
             return
+        if world.lifted:
+            self._blocks[0].flags[:] = _INVALID
         self._blocks[0].data[:] = (*world.pose, *world.speed)
         count = len(world.fingers)
         for finger, felt, joints in zip(

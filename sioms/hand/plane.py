@@ -33,6 +33,7 @@ from sioms.tactile.quality import Quality, State
 
 T = TypeVar("T")
 SHAPE = FingerShape()
+RUBBER_M = SHAPE.radius_m - SHAPE.core_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,7 +96,7 @@ class PlaneHand:
         seen: called with the hand and the set-point after every tick.
 
     Raises:
-        ValueError: an object that overlaps a finger at the start, or coordinates that have no joints.
+        ValueError: a finger deeper in the object than its rubber at the start, or coordinates that have no joints.
 
     Concurrency: one caller at a time.
     """
@@ -110,6 +111,13 @@ class PlaneHand:
         first = start or (0.0, 0.0, 0.0, rig.open_m, NEUTRAL, NEUTRAL)
         self.joints = list(self.hand.inverse(first))
         self.world = World(body, mounts, [self.joints[:3], self.joints[3:]], pose)
+        inside = [number for number, gap in enumerate(self.world.clearances(), 1) if gap < -RUBBER_M]
+        if inside:
+            raise ValueError(
+                f"build hand over object: finger {' and '.join(map(str, inside))} would be deeper in the object than "
+                f"its rubber is thick; it lies at {pose[0]:g}, {pose[1]:g} m with a turn of {pose[2]:g} rad; want it "
+                "between the fingers"
+            )
         self.controller = Controller(rig.gains)
         self._arrays = [TactileArray(SHAPE, 1.0, 0.0, rig.noise, rig.resolution, 2 * seed + i) for i in (0, 1)]
         for array in self._arrays:

@@ -172,6 +172,7 @@ class World:
     Attributes:
         fingers: their states.
         pose, speed: of the object, x, y [m], angle [rad].
+        lifted: whether the object is off the platen, where no finger meets it.
         time_s: gone so far.
 
     Raises:
@@ -196,7 +197,7 @@ class World:
             Finger(mount, list(joint), command=list(joint)) for mount, joint in zip(mounts, joints, strict=True)
         ]
         self.pose, self.speed = list(pose), [0.0, 0.0, 0.0]
-        self.time_s = 0.0
+        self.lifted, self.time_s = False, 0.0
         outline = body.outline
         self._points: list[tuple[float, float]] = [(float(x), float(y)) for x, y in outline.points]
         self._inertia = body.mass * outline.gyration_m**2
@@ -226,6 +227,38 @@ class World:
             finger.place = [at + to - was for at, to, was in zip(finger.place, joint, finger.command, strict=True)]
             finger.command = list(joint)
             finger.speed, finger.rate = [0.0, 0.0, 0.0], [0.0, 0.0, 0.0]
+
+    def clearances(self, pose: Sequence[float] | None = None) -> list[float]:
+        """Return how far each finger is from the object [m], below 0 where they overlap, even one inside the other.
+
+        Args:
+            pose: of the object; where it is now by default.
+        """
+        ox, oy, turn = self.pose if pose is None else pose
+        corners = np.array(self._points)
+        sides = np.roll(corners, -1, axis=0) - corners
+        c, s = math.cos(turn), math.sin(turn)
+        found = []
+        for finger in self.fingers:
+            dx, dy = finger.centre[0] - ox, finger.centre[1] - oy
+            way = np.array([c * dx + s * dy, c * dy - s * dx]) - corners
+            share = np.clip(np.einsum("ij,ij->i", way, sides) / np.einsum("ij,ij->i", sides, sides), 0.0, 1.0)
+            apart = float(np.min(np.linalg.norm(way - share[:, None] * sides, axis=1)))
+            inside = bool(np.all(sides[:, 0] * way[:, 1] - sides[:, 1] * way[:, 0] > 0.0))
+            found.append((-apart if inside else apart) - self.skin.outer_m)
+        return found
+
+    def lift(self) -> None:
+        """Take the object off the platen: fingers meet nothing."""
+        self.lifted, self.speed = True, [0.0, 0.0, 0.0]
+        for finger in self.fingers:
+            self._touch(finger, 0.0)
+
+    def lay(self, pose: Sequence[float]) -> None:
+        """Lay the object on the platen, at rest."""
+        self.lifted, self.pose, self.speed = False, list(pose), [0.0, 0.0, 0.0]
+        for finger in self.fingers:
+            self._touch(finger, 0.0)
 
     def advance(self, time_s: float, steps: int) -> None:
         """Go on by `time_s` in equal steps; 0.25 ms or less follow the stiffest contacts."""
@@ -355,6 +388,8 @@ class World:
         """
         points, (ox, oy, turn), rb = self._points, self.pose, self.skin.outer_m
         cx, cy = finger.centre
+        if self.lifted:
+            return 0.0, 0.0, finger.phi + finger.place[2], LOST, cx, cy
         c, s = math.cos(turn), math.sin(turn)
         dx, dy = cx - ox, cy - oy
         u, v = c * dx + s * dy, c * dy - s * dx

@@ -113,6 +113,17 @@ def test_a_finger_that_is_pressed_lets_go_and_the_first_fault_is_told() -> None:
     assert not jammed.is_held() and jammed.joints[3] - jammed.joints[0] > 2 * (74 * MM + RB) - 4 * MM
 
 
+def test_an_object_in_which_a_finger_would_be_is_refused() -> None:
+    """Deeper than the rubber, on one side, on both, and around a finger; what only presses the rubber is not."""
+    for outline, pose, which in (
+        (disk(76 * MM), (0.0, 0.0, 0.0), "finger 1 and 2"), (disk(20 * MM), (60 * MM, 0.0, 0.0), "finger 2"),
+        (rectangle(60 * MM, 80 * MM), (-85 * MM, 0.0, 0.3), "finger 1"),
+    ):  # fmt: skip
+        with pytest.raises(ValueError, match=f"build hand over object: {which} would be deeper in the object"):
+            PlaneHand(Body(outline), pose, RIG)
+    PlaneHand(Body(disk(74 * MM)), (0.0, 0.0, 0.0), RIG)
+
+
 def _idle(hand: PlaneHand) -> Setpoint:
     return Setpoint(hand.hand.forward(hand.reading.joints), (0.0,) * 6, 0.0, frozen=True)
 

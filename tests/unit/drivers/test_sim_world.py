@@ -11,6 +11,8 @@ from sioms.drivers.sim.force import SimForce
 from sioms.drivers.sim.tactile import SimTactile
 from sioms.drivers.sim.world import SimWorld
 from sioms.plant.finger import FingerShape, TactileArray
+from sioms.plant.outline import rectangle
+from sioms.plant.planar import Body, Mount, World
 from sioms.protocol.flags import AnalogStatus, ControlMode
 from sioms.sdk.exchange import LinkError
 
@@ -175,12 +177,16 @@ def test_names_of_fingers_are_one_each_and_steppers_bear_no_loads():
 SOFT = MOUNT | {"link_m": 0.14, "stiffness": 2.5e4, "turn_stiffness": 3.0, "mass": 0.2}
 
 
+def carrying_table(**of_object):
+    table = world(**of_object)
+    table["finger"][0]["mount"] = SOFT
+    return table
+
+
 @pytest.fixture
 def carrying(bench):
     """Return a world and a module that goes on pressing its finger, on a link across that, on a heavy disk."""
-    table = world(pose=[0.14, RB + 0.0205, 0.0])
-    table["finger"][0]["mount"] = SOFT
-    plane = bench.make(SimWorld, "world", table)
+    plane = bench.make(SimWorld, "world", carrying_table(pose=[0.14, RB + 0.0205, 0.0]))
     axes = module(loads=False)["axis"]
     axes[2]["motor"] |= {"mass": 3e-4, "viscous": 2e-3}
     axes[2] |= {"bandwidth_hz": 5.06, "force_max": 0.8, "following_error_max": 2.5, "velocity_max": 3.0}
@@ -280,3 +286,65 @@ def test_a_world_that_ticks_seldom_keeps_its_time(bench):
     plane = bench.make(SimWorld, "world", table)
     bench.run(2.0)
     assert plane._world.time_s == pytest.approx(1.9)  # the first tick makes it
+
+
+# --- no finger is put into the object ---------------------------------------------------------------------
+
+
+@pytest.fixture
+def logged(bench, monkeypatch):
+    """Return the sentences that go to the log."""
+    found = []
+    monkeypatch.setattr(bench, "log", lambda level, text: found.append(text))
+    return found
+
+
+def lies(plane):
+    """Return where the object is shown to lie; None while that is flagged invalid."""
+    block = plane.blocks[0]
+    return None if np.any(block.flags & int(AnalogStatus.INVALID)) else block.data[:3].tolist()
+
+
+def test_a_world_that_starts_anew_around_a_finger_is_empty_until_that_has_gone(bench, logged, carrying):
+    """The world that died had its object pushed away; the next one has it where the finger now is."""
+    plane, arm = carrying
+    arm.bank.stop(np.arange(3), bench.clock_ns)
+    bench.run(0.1)
+    bench.halted.append(plane)
+    away = carrying_table(pose=[0.14, RB + 0.0195, 0.0])
+    again = bench.make(SimWorld, "world", away)
+    bench.run(0.05)
+    assert lies(again) is None and "left would be put into the object" in logged[-1]
+    assert felt(again, "normal") == 0.0 and felt(again, "x_load") == pytest.approx(0.0, abs=1e-6)
+    arm.bank.reset(np.arange(3))
+    bench.run(0.01)
+    assert not any(fault(arm, axis) for axis in range(3))  # it may go away without an object
+    bench.write(arm, axis=1, control_mode=ControlMode.VELOCITY, velocity=-0.05)
+    most = highest(bench, 0.5, lambda: felt(again, "normal"))[0]
+    assert most == 0.0 and lies(again) == pytest.approx([0.14, RB + 0.0195, 0.0])
+    assert "it lies there now" in logged[-1]
+
+
+@pytest.mark.parametrize("into_m", [0.002, 0.02, 0.0328])
+def test_a_module_that_comes_back_elsewhere_puts_no_finger_into_the_object(bench, logged, into_m):
+    """Its finger was beside the object, and would be at its edge, in its middle, or deep within."""
+    plane = bench.make(SimWorld, "world", world())
+    arm = bench.make(SimAxes, "mod0", module(loads=False))
+    bench.run(0.1)
+    bench.halted.append(arm)
+    bench.inputs["mod0.plant.x_position"].detach()
+    plane.tick(bench.clock_ns + 1_000_000)
+    moved = module(loads=False)
+    moved["axis"][0]["motor"]["start"] = 0.035 - 0.02 - RB + into_m
+    bench.make(SimAxes, "mod0", moved)
+    most = highest(bench, 0.1, lambda: felt(plane, "normal"))[0]
+    assert most == 0.0 and lies(plane) is None and "left would be put" in logged[-1]
+
+
+def test_distances_of_fingers_are_right_inside_of_the_object_too():
+    body = Body(rectangle(0.04, 0.06))
+    for x, clearance in ((0.05, 0.03 - RB), (0.02, -RB), (0.015, -0.005 - RB), (0.0, -0.02 - RB)):
+        plane = World(body, [Mount(link_m=0.0)], [[x, 0.0, 0.0]])
+        assert plane.clearances() == pytest.approx([clearance])
+        turned = plane.clearances((x, 0.0, 0.5 * math.pi))  # the centre of the finger in that of the object
+        assert turned == pytest.approx([-0.02 - RB])
