@@ -54,6 +54,11 @@ def events(count: int) -> list[Event]:
 
 def write(path: Path, count: int = 200, first: int = 1, nodes: list[NodeInfo] = NODES) -> Path:
     """Write a live recording of some snapshots of each node and a few events."""
+    return write_slots(path, nodes, [slots(node, first, count) for node in nodes])
+
+
+def write_slots(path: Path, nodes: list[NodeInfo], told: list[NDArray[np.uint64]]) -> Path:
+    """Write a live recording of what each node told and a few events."""
     schemas: dict[str, int] = {}
     defined: list[bytes] = []
 
@@ -68,8 +73,8 @@ def write(path: Path, count: int = 200, first: int = 1, nodes: list[NodeInfo] = 
     forms = [NodeFormat(node, -1, 2 + 2 * i, schema, OFFSET_NS) for i, node in enumerate(nodes)]
     defined += [channel.packed() for form in forms for channel in form.channels]
     data += sorted(defined, key=lambda record: record[0])
-    for at in range(0, count, 20):
-        data += [f.messages(slots(n, first + at, min(20, count - at))) for f, n in zip(forms, nodes, strict=True)]
+    for at in range(0, max(map(len, told)), 20):
+        data += [form.messages(one[at : at + 20]) for form, one in zip(forms, told, strict=True)]
     for event in events(5):
         data.append(mcap.message(1, event.number, event.stamp_ns + OFFSET_NS, event.packed()))
     path.write_bytes(b"".join(data))

@@ -1,6 +1,7 @@
 """``sioms hand record``: grasp a known object in many ways, and write what ``sioms reconcile hand`` reads.
 
-On the hand of a running workcell, or with ``--plane`` on a simulated hand in this process, which may hide effects:
+On the hand of a running workcell, or with ``--plane`` on a simulated hand in this process, which may hide effects;
+``--from`` takes the grasps that a recording of the workcell holds instead of making any:
 
     [finger1]
     link_m = 0.142           # keys of `sioms.plant.planar.Mount`
@@ -10,6 +11,7 @@ On the hand of a running workcell, or with ``--plane`` on a simulated hand in th
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -47,6 +49,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
     parser.add_argument("--append", action="store_true", help="continue FILE: another object in the same session")
     parser.add_argument("--seed", type=whole(), default=1, metavar="N", help="seed of the grasps (default 1)")
+    parser.add_argument(
+        "--from", dest="recording", type=Path, metavar="MCAP",
+        help="take the holds of this recording of the workcell (sioms record); without --disk and --bar the object is "
+        "an unknown one",
+    )  # fmt: skip
     parser.add_argument("--plane", action="store_true", help="use a simulated hand in this process")
     parser.add_argument(
         "--hidden", type=Path, metavar="FILE", help="with --plane: what the simulated hand hides (TOML)"
@@ -62,29 +69,22 @@ def run(args: argparse.Namespace) -> int:
         ValueError: no object, a file that is there, or one that cannot be continued.
         OSError: a node that is not there, or a hand that was stopped.
     """
-    from sioms.hand.survey import (
-        BAR,
-        DISK,
-        LOADS_N,
-        SLIPS_N,
-        Thing,
-        continued,
-        next_grasp,
-        settings,
-        text_of,
-    )
+    from sioms.hand.survey import LOADS_N, SLIPS_N, continued, next_grasp, settings, text_of
     from sioms.hand.touch import Failed
     from sioms.whole_file import write_whole
 
-    if (args.disk is None) == (args.bar is None):
-        raise ValueError("record grasps: nothing is said of the object; want --disk RADIUS or --bar WIDTH")
     if len(args.wrists) not in (0, 2):
         raise ValueError(f"record grasps: {len(args.wrists)} wrists; want two, or --wrists without a name")
+    unknown = args.disk is None and args.bar is None
+    if args.recording is not None:
+        return _from_recording(args, None if unknown else _thing(args))
+    if unknown:
+        raise ValueError("record grasps: nothing is said of the object; want --disk RADIUS or --bar WIDTH")
     if args.slips and (args.bar is None or not (args.wrists or args.plane)):
         raise ValueError("record slips: want --bar WIDTH, clamped to the platen, and both --wrists")
     if args.hidden is not None and not args.plane:
         raise ValueError("record grasps: --hidden is for a simulated hand; want --plane with it")
-    thing = Thing(DISK, args.disk, args.thing) if args.bar is None else Thing(BAR, args.bar, args.thing)
+    thing = _thing(args)
     past = earlier(args.output, args.append)
     plan = settings(args.grasps, args.forces or (SLIPS_N if args.slips else LOADS_N), seed=args.seed)
     surveys: list[Survey] = []
@@ -102,6 +102,29 @@ def run(args: argparse.Namespace) -> int:
     grasps = len({row[1] for row in rows})
     print(f"{grasps} of {len(plan)} grasps recorded, {len(rows)} rows: {args.output}")
     return 0 if grasps == len(plan) else 1
+
+
+def _thing(args: argparse.Namespace) -> Thing:
+    from sioms.hand.survey import BAR, DISK, Thing
+
+    return Thing(DISK, args.disk, args.thing) if args.bar is None else Thing(BAR, args.bar, args.thing)
+
+
+def _from_recording(args: argparse.Namespace, thing: Thing | None) -> int:
+    """Write the grasps that a recording holds."""
+    from sioms.hand.command.recorded import rows_from
+    from sioms.hand.survey import OTHER, continued, next_grasp, text_of
+    from sioms.whole_file import write_whole
+
+    if args.plane or args.slips or args.forces:
+        raise ValueError("record grasps: --from makes none; want it without --plane, --slips and --forces")
+    past = earlier(args.output, args.append)
+    first = next_grasp(past)
+    what = (OTHER, args.thing, math.nan) if thing is None else (thing.kind, thing.number, thing.size_m)
+    rows = rows_from(args.recording, what, args.node, args.fingers, args.modules, args.wrists, first)
+    write_whole(args.output, text_of(continued(past, rows)))
+    print(f"{len({row[1] for row in rows})} grasps found, {len(rows)} rows: {args.output}")
+    return 0
 
 
 def tell(text: str) -> None:
