@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from contextlib import suppress
 from time import monotonic, monotonic_ns
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -290,11 +291,11 @@ class FleetVerbs(Generic[C]):
         """
         why = printable(str(why))
         calls = []
-        for cell in self.cells.values():
-            call = Call("emergency stop", verbs.EmergencyStop("", why))
-            call.enough = request_stop(cell._request, why)
-            calls.append((cell, call))
         try:
+            for cell in self.cells.values():
+                call = Call("emergency stop", verbs.EmergencyStop("", why))
+                call.enough = request_stop(cell._request, why)
+                calls.append((cell, call))
             answers = await self._together.calls(calls)
         except BaseException:  # interrupted, or cancelled: all hear of it before this ends
             self._stop_unasked(why)
@@ -314,13 +315,16 @@ class FleetVerbs(Generic[C]):
 
     def _stop_unasked(self, why: str) -> None:
         """Tell all cells to stop, without waiting for their answers; a second time does no harm."""
-        for cell in self.cells.values():
-            call = Call("emergency stop", verbs.EmergencyStop("", why))
-            try:
-                cell._channel.send(call)
-            except OSError:
+        told: set[str] = set()
+        for name in [*self.cells, *self.cells]:  # once more for one at which a second interrupt comes
+            if name in told:
                 continue
-            cell._channel.abandon(call)
+            cell, call = self.cells[name], Call("emergency stop", verbs.EmergencyStop("", why))
+            with suppress(OSError, KeyboardInterrupt):
+                request_stop(cell._request, why)
+                cell._channel.send(call)
+                told.add(name)
+                cell._channel.abandon(call)
 
     async def _stop_again(self, name: str, why: str) -> None:
         cell = await self._together.connect(self._addresses[name], self._name)

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 from daemon_rig import axes, daemons, raises, wait_for
@@ -180,6 +181,26 @@ def test_a_stop_that_is_interrupted_reaches_all_cells(fleet: sioms.Fleet) -> Non
         places = at
     assert places > 5
     fleet.reset()
+
+
+def test_a_stop_that_is_interrupted_while_it_tells_the_cells_reaches_all_or_none(fleet: sioms.Fleet) -> None:
+    """None only before the first has been told."""
+    stopped = []
+    for at in interrupted_everywhere(lambda: fleet.emergency_stop("enough"), ("sioms.client.fleet_verbs",)):
+        found = {name: bool(s["stopped_ns"]) for name, s in _settled(fleet).items()}
+        assert len({*found.values()}) == 1, f"place {at}: {found}"
+        stopped.append(all(found.values()))
+        fleet.reset()
+    assert sum(stopped) > 5 and stopped == sorted(stopped), stopped
+    fleet.reset()
+
+
+def _settled(fleet: sioms.Fleet) -> dict[str, dict[str, Any]]:
+    """Return the status of the cells when all have had the time to stop."""
+    until = time.monotonic() + 0.3
+    while not all(s["stopped_ns"] for s in fleet.status().values()) and time.monotonic() < until:
+        time.sleep(0.005)
+    return fleet.status()
 
 
 def test_a_start_that_is_interrupted_starts_nothing(fleet: sioms.Fleet) -> None:
