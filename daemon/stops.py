@@ -12,6 +12,7 @@ from typing import Any
 
 from sioms.protocol import driver_verbs
 from sioms.protocol.stopjournal import NODE, PID, node_entry, parts_of, workcell_entry
+from sioms.protocol.verbs import Message
 
 from .cell import Cell
 from .devices import DriverProcess
@@ -105,7 +106,7 @@ class Stops:
             OSError: EIO, its driver takes no messages: it will be stopped when it is started again.
         """
         try:
-            self._order(node, driver_verbs.NodeStop, source)
+            self._order(node, driver_verbs.NodeStop(*_parts(node), source, self._shared.latch.resets))
         finally:
             self._note(self._node_entry(node, source, stop=True))
             self._cell.log("warning", "emergency stop", node=node.name, source=source)
@@ -122,20 +123,20 @@ class Stops:
         record.look()
         before = [entry for entry in record.state.entries() if entry.get("device") == node.device]
         self._note(self._node_entry(node, who, stop=False))
+        resets, now_ns = self._shared.latch.resets, time.monotonic_ns()
         try:
-            self._order(node, driver_verbs.NodeReset, who, time.monotonic_ns())
+            self._order(node, driver_verbs.NodeReset(*_parts(node), who, resets, now_ns))
         except OSError:
             for entry in before:
                 self._note(entry)
             raise
         self._cell.log("warning", "reset", node=node.name, by=who)
 
-    def _order(
-        self, node: Node, order: type[driver_verbs.NodeStop | driver_verbs.NodeReset], source: str, *at_ns: int
-    ) -> None:  # fmt: skip
+    def _order(self, node: Node, order: Message) -> None:
+        """Send the driver of a node an order, which its next tick obeys first."""
         device = self._cell.devices.get(node.device) or self._cell.leaving.get(node.device)
         if device is not None and device.is_there:
-            device.send(order(node.block, node.channels, node.bit, source, self._shared.latch.resets, *at_ns))
+            device.send(order)
             self._shared.latch.ordered()
 
     def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:
@@ -208,3 +209,8 @@ class Stops:
         if (source := self._shared.record.state.workcell) and not self._shared.latch.stopped_ns:
             self.stop_workcell(source)  # a driver could not keep a stop
         self._pass_on_stops()
+
+
+def _parts(node: Node) -> tuple[int, list[int], int]:
+    """Return the block, the channels and the bit that a node shows."""
+    return node.block, list(node.channels), node.bit

@@ -9,6 +9,7 @@ from contextlib import suppress
 
 SHARE = 0.25
 """Of a processor, what threads that somebody else keeps busy may take in the real-time class."""
+_PROMPT = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 ORDINARY_S = 1.0
 """How long they are ordinary ones when they have taken more [s]."""
 
@@ -22,7 +23,7 @@ def be_prompt() -> bool:
         Whether it does so from now on.
     """
     try:
-        os.sched_setscheduler(0, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, os.sched_param(1))
+        os.sched_setscheduler(0, _PROMPT, os.sched_param(1))
     except OSError:
         return False
     return True
@@ -40,10 +41,11 @@ class BoundedPrompt:
         self._ordinary_until_ns = 0
 
     def enter(self) -> None:
-        """Have the thread that calls be one of them; again: nothing."""
+        """Have the thread that calls be one of them, and as prompt as these are now; again: nothing."""
         thread = threading.get_native_id()
         if thread not in self._ran_ns:
-            self._ran_ns[thread] = _ran_ns(thread) if be_prompt() else -1
+            may = self._ordinary_until_ns or be_prompt()
+            self._ran_ns[thread] = _ran_ns(thread) if may else -1
 
     def look(self) -> None:
         """Make them ordinary when they have taken more than their share since the last look, and prompt again later."""
@@ -64,10 +66,10 @@ class BoundedPrompt:
             self._ordinary_until_ns = now_ns + int(ORDINARY_S * 1e9)
         elif self._ordinary_until_ns and now_ns > self._ordinary_until_ns:
             self._ordinary_until_ns = 0
-            self._set(os.SCHED_FIFO | os.SCHED_RESET_ON_FORK, 1)
+            self._set(_PROMPT, 1)
 
     def _set(self, policy: int, priority: int) -> None:
-        for thread, ran_ns in self._ran_ns.items():
+        for thread, ran_ns in list(self._ran_ns.items()):  # another thread may enter
             if ran_ns >= 0:
                 with suppress(OSError):
                     os.sched_setscheduler(thread, policy, os.sched_param(priority))

@@ -693,18 +693,18 @@ class Runtime:
                 if was_held:
                     self._stop_held()
             case driver_verbs.NodeStop() | driver_verbs.NodeReset():
-                block, channels, bit, text, resets, *at_ns = message
                 self.stops.heed()  # a reset that came before it must not come after it
-                is_over = resets != self.latch.resets  # the workcell has been reset since then
-                if isinstance(message, driver_verbs.NodeStop):
-                    stop = self.stops.stop_in_passing if is_over else self.stops.stop_node
-                    stop(self.blocks[block], channels, bit, text)
-                    return
-                if is_over:
-                    return
-                try:
-                    self.stops.reset_node(self.blocks[block], channels, bit, "reset", at_ns[0])
-                except (OSError, CommandError) as error:
-                    self.log("warning", str(error))
+                self._obey_of_node(message, self.blocks[message.block])
             case _:
                 raise NotImplementedError(f"{type(message).__name__} is not served")
+
+    def _obey_of_node(self, order: driver_verbs.NodeStop | driver_verbs.NodeReset, block: AnyBlock) -> None:
+        is_over = order.resets != self.latch.resets  # the workcell has been reset since then
+        if isinstance(order, driver_verbs.NodeStop):
+            stop = self.stops.stop_in_passing if is_over else self.stops.stop_node
+            stop(block, order.channels, order.bit, order.source)
+        elif not is_over:
+            try:
+                self.stops.reset_node(block, order.channels, order.bit, "reset", order.at_ns)
+            except (OSError, CommandError) as error:
+                self.log("warning", str(error))

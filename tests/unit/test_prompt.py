@@ -69,3 +69,22 @@ def test_threads_that_others_keep_busy_are_ordinary_for_a_while(monkeypatch: pyt
     now_ns[0] += 100_000_000
     bounded.look()
     assert not bounded._ran_ns, "a thread that has ended is none"
+
+
+def test_a_thread_that_begins_while_the_others_are_ordinary_is_so_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    now_ns, thread, classes = [0], [11], list[tuple[int, int]]()
+    monkeypatch.setattr(prompt, "_ran_ns", lambda _: now_ns[0])
+    monkeypatch.setattr(prompt.time, "monotonic_ns", lambda: now_ns[0])
+    monkeypatch.setattr(prompt.threading, "get_native_id", lambda: thread[0])
+    monkeypatch.setattr(prompt.os, "sched_setscheduler", lambda who, policy, _: classes.append((who, policy)))
+    bounded, real_time = BoundedPrompt(), os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+    bounded.enter()
+    now_ns[0] = 100_000_000  # and it ran all that time
+    bounded.look()
+    thread[0] = 12
+    bounded.enter()
+    assert classes == [(0, real_time), (11, os.SCHED_OTHER)]
+    monkeypatch.setattr(prompt, "_ran_ns", lambda _: 0)
+    now_ns[0] += int(prompt.ORDINARY_S * 1.1e9)
+    bounded.look()
+    assert classes[2:] == [(11, real_time), (12, real_time)]
