@@ -23,13 +23,12 @@ from .arrival import Approach
 from .bank import Axes, Bank
 from .commands import Command, is_point_move
 from .profile import InfeasibleError
-from .queue import EMERGENCY_STOP, FAULT, LOST, AxesLike
+from .queue import FAULT, LOST, AxesLike
 from .settings import AxisSettings
 from .store import NEVER_NS
 from .types import EventKind, MarkerPort
 from .watch import MotionWatch, Order, order_of
 
-LATCHED = FAULT | EMERGENCY_STOP
 FIRST_REPEAT_NS = 50_000_000
 LONGEST_REPEAT_NS = 1_000_000_000
 """How often a stop is sent again that failed, or that the drive does not obey."""
@@ -184,10 +183,6 @@ class DriveBank(Bank):
         self._outcome[chosen] |= int(side)
         self._outcome[forces] |= int(AxisStatus.FORCE_ENDED)
 
-    def is_latched(self, axis: int) -> bool:
-        """Tell whether an emergency stop or a fault of an axis is latched: its drive must not be switched on."""
-        return bool(self._queue.latched[axis] & LATCHED)
-
     def poll(
         self,
         now_ns: int,
@@ -315,7 +310,7 @@ class DriveBank(Bank):
                     f"{self._velocity[axis]:.3g} {unit}/s"
                 )
                 self._fault_fresh(np.array([axis]), text, now_ns)
-            latched = bool(self._queue.latched[axis] & LATCHED)
+            latched = self.is_latched(axis)
             self._again_ns[axis] = NEVER_NS
             self._stops[axis] = ActionKind.QUICK_STOP if latched else ActionKind.STOP
             self._acknowledged[axis] = False
@@ -340,7 +335,7 @@ class DriveBank(Bank):
                 confirmed=bool(heard[axis] and self._acknowledged[axis]),
                 late_ns=now_ns - asked_ns,
                 holds=holds is None or bool(holds[axis]),
-                latched=bool(self._queue.latched[axis] & LATCHED),
+                latched=self.is_latched(axis),
             )
             if found is None:
                 continue

@@ -65,6 +65,11 @@ class ForceEnds:
         self._direction[axes], self.asked[axes] = 0.0, math.nan
         self.any = bool(self._direction.any())
 
+    def is_bound(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which axes are bounded: they have not come to rest yet."""
+        bound: NDArray[np.bool_] = self._direction[axes] != 0.0
+        return bound
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what the law bounds outputs by, by the names of its fields."""
         return {"asked": self.asked, "direction": self._direction, "most": self._most, "presses": self._presses}

@@ -97,6 +97,8 @@ class AxisBank(Bank):
         self._limp, self._actuator, self._last_raw = self._law.limp, self._law.actuator, arrays["last_raw"]
         self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
         self._any_limp = False
+        self._lets_go = np.zeros(self.n, dtype=bool)
+        """Axes that press no more when they have come to rest."""
         self._tick_s, self._makes_up = tick_s, makes_up
         self._again = False
 
@@ -164,19 +166,21 @@ class AxisBank(Bank):
         self._sequencer.drop(axes)
 
     def _halt(self, axes: Axes, now_ns: int, *, fastest: bool) -> None:
-        """Brake; in force mode the controlled stop holds, the fastest one lets go until reset()."""
+        """Brake; in force mode the controlled stop holds, the fastest one lets go until reset(), when it has braked."""
         brakes, self._braked_ns = self._braked_ns > 0, 0
         in_force = axes[self._sequencer.kind[axes] == FORCE] if fastest else axes[:0]
         self._homing.cancel(axes)
         self._sequencer.halt(axes, now_ns, brakes=brakes)
         if in_force.size:
-            self._set_limp(in_force)
+            brakes_first = self._law.moves(in_force) & self._law.force_ends.is_bound(in_force)
+            self._set_limp(in_force[~brakes_first])
+            self._lets_go[in_force[brakes_first]] = True
 
     def _let_go(self, axes: Axes) -> None:
         self._set_limp(axes[~self.stepper[axes]])
 
     def _set_limp(self, axes: Axes) -> None:
-        self._limp[axes] = True
+        self._limp[axes], self._lets_go[axes] = True, False
         self._any_limp = bool(self._limp.any())
         self._sequencer.settle(axes, self._last_ns)
 
@@ -187,6 +191,7 @@ class AxisBank(Bank):
             for axis in lost.tolist():
                 self._law.anchor_at(axis, float(self._position[axis]))
             self._sequencer.hold(lost, self._position[lost], self._last_ns)
+        self._lets_go[axes] = False
         limp = axes[self._limp[axes]]
         if limp.size:
             self._limp[limp] = False
@@ -421,6 +426,9 @@ class AxisBank(Bank):
             law.give_way(axes)
             self._sequencer.hold(axes, self._position[axes], self._last_ns)
             self._desired[axes], self._desired_velocity[axes] = self._position[axes], 0.0
+        letting_go = np.flatnonzero(self._lets_go)
+        if letting_go.size:
+            self._set_limp(letting_go[~law.force_ends.is_bound(letting_go)])
 
     # -- watching -----------------------------------------------------------------------------
 

@@ -488,6 +488,32 @@ def test_what_follows_a_force_presses_no_harder_than_the_force(force: float, way
         assert abs(rig.field("position")) < 1e-3, "afterwards it has all its force again"
 
 
+@pytest.mark.parametrize("way", [0.02, 0.06, 1.0])
+@pytest.mark.parametrize("ticks", [110, 2000])
+def test_an_emergency_stop_of_a_force_brakes_what_moves_and_then_presses_no_more(way: float, ticks: int) -> None:
+    """In free space there is next to no friction: nothing else would brake it."""
+    rig = Rig([axis(velocity_max=0.5, acceleration_max=2.0, force_max=50.0, k=4e4, kz=-0.95, kb=-4.0)])
+    wall = Wall(way, viscous=1e-3 if way == 1.0 else 5.0)
+    rig.plant = wall.before(rig)
+    rig.write(mode=MODE.FORCE, force=4.0)
+    rig.tick(ticks if way < 1.0 else 110)
+    velocity, place = rig.field("velocity"), rig.field("position")
+    rig.bank.emergency_stop([0], rig.now_ns)
+    presses = []
+    for _ in range(900):
+        rig.tick()
+        presses.append(rig.field("force"))
+        assert presses[-1] <= (5.0 if rig.field("velocity") < -0.005 else 4.0) + 1e-6, "more only if thrown back"
+    assert abs(presses[-1]) < 1e-9
+    assert abs(rig.field("velocity")) < 0.005
+    if way == 1.0:
+        assert velocity > 0.3 and rig.field("position") - place < 1.2 * velocity**2 / (2 * 2.0)
+    assert wall.force < 1e-3, "it lies at the wall at most"
+    rig.bank.reset([0])
+    rig.tick(100)
+    assert rig.bank.is_idle([0]) and abs(rig.field("velocity")) < 0.005
+
+
 def test_the_bound_of_a_force_is_lifted_at_rest() -> None:
     """What is held then is held with all there is; a zero force that is stopped in motion holds, too."""
     for force in (3.0, 0.0):

@@ -41,6 +41,7 @@ VERBS: dict[str, Verb] = {
     "get_limits": lambda bank, now: bank.get_limits([0]),
     "home": lambda bank, now: bank.home([0], now),
     "set_homed": lambda bank, now: bank.set_homed([1]),
+    "is_latched": lambda bank, now: bank.is_latched(0),
     "is_idle": lambda bank, now: bank.is_idle([0, 1]),
     "diagnostics": lambda bank, now: bank.diagnostics([0, 1]),
     "take_events": lambda bank, now: bank.take_events() and None,
