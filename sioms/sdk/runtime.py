@@ -20,7 +20,6 @@ from typing import Any
 
 import numpy as np
 
-from sioms.motion import CommandError
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, Note
@@ -29,7 +28,6 @@ from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import StopJournal
 from sioms.protocol.text import printable
-from sioms.protocol.verbs import Message
 from sioms.turns import Turns
 
 from .alarm_watch import AlarmWatch
@@ -47,6 +45,7 @@ from .held import Held
 from .idling import Idling
 from .inputs import Input
 from .markers import Markers
+from .orders import Orders
 from .outputs import Outputs
 from .pages import Pages
 from .parts import Parts, Service
@@ -141,11 +140,14 @@ class Runtime:
             self.driver, self.engine, Reports(self.statistics, self.engine, self.driver, handles),
         )  # fmt: skip
         self.clients = Attachments(handles, service, self.turns, self.tell, self.journal)
+        self._orders = Orders(
+            self.blocks, self.clients, self.stops, self.inputs, self.held, self.latch, self.log, self.end,
+            self._stop_held,
+        )  # fmt: skip
         self.period_ns = int(1e9 / self.engine.tick_hz)
         self.waits.a_look = max(LOOKS_A_MS, LOOKS_A_MS * self.period_ns // 1_000_000)
         self._idling = Idling(self.period_ns, lease_ns)
         self._stops_workcell = bool(options["stop_sources"])
-        self._is_used = False
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self._announced = self._slack_ns = self._spare_until_ns = 0
         self._expired, self.sees_requests = 0, False
@@ -382,7 +384,7 @@ class Runtime:
         early_ns = 0 if self._announced else self._line_due_ns or 0
         if self._quiet is None or self._ending_ns or self._daemon_late or self.pause_s is not None:
             return None
-        watched = bool(self.clients.handles) or self._is_used
+        watched = bool(self.clients.handles) or self._orders.is_used
         lent = self._quiet.lend(
             self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns, early_ns, self._ticked_ns,
             self.looked_ns, self._braked_ns,
@@ -514,7 +516,7 @@ class Runtime:
 
     def _rest(self, engine: TickEngine, now_ns: int) -> None:
         """Tick seldom when nobody looks and nothing has happened for a while."""
-        if self._is_used or self._stops_workcell or not engine.is_at_rest():
+        if self._orders.is_used or self._stops_workcell or not engine.is_at_rest():
             self._wake()
         else:
             self._be_idle(now_ns)
@@ -561,7 +563,7 @@ class Runtime:
         if self.stops.heed_orders():
             for order in self._control.orders():
                 self._wake()
-                self._obey(order, [])
+                self._orders.obey(order, [])
         self.stops.heed()
 
     def _tick_and_publish(self, scheduled_ns: int) -> int:
@@ -665,46 +667,4 @@ class Runtime:
             return
         if received is not None:
             self._wake()
-            self._obey(*received)
-
-    def _obey(self, message: Message, fds: list[int]) -> None:
-        match message:
-            case driver_verbs.Attach():
-                self.clients.attach(fds, message)
-            case driver_verbs.Detach(handle, errno_, reason):
-                self.clients.detach(handle, errno_, reason)
-            case driver_verbs.InUse(used):
-                self._is_used = used
-            case driver_verbs.StopChanged():
-                self.stops.look()
-            case driver_verbs.Shutdown():
-                self.end("the device was taken out of service")
-            case driver_verbs.Input(name, channels, bit):
-                if not fds:  # the kernel drops what goes beyond the limit
-                    self.log("error", f"{name} cannot be read: too many open descriptors")
-                    return
-                self.inputs[name].attach(fds[0], channels, bit)
-            case driver_verbs.Held(name, channels):
-                if not fds:
-                    self.log("error", f"{name} cannot be held: too many open descriptors")
-                    return
-                was_held = self.held[name].is_there
-                self.held[name].attach(fds[0], channels)
-                if was_held:
-                    self._stop_held()
-            case driver_verbs.NodeStop() | driver_verbs.NodeReset():
-                self.stops.heed()  # a reset that came before it must not come after it
-                self._obey_of_node(message, self.blocks[message.block])
-            case _:
-                raise NotImplementedError(f"{type(message).__name__} is not served")
-
-    def _obey_of_node(self, order: driver_verbs.NodeStop | driver_verbs.NodeReset, block: AnyBlock) -> None:
-        is_over = order.resets != self.latch.resets  # the workcell has been reset since then
-        if isinstance(order, driver_verbs.NodeStop):
-            stop = self.stops.stop_in_passing if is_over else self.stops.stop_node
-            stop(block, order.channels, order.bit, order.source)
-        elif not is_over:
-            try:
-                self.stops.reset_node(block, order.channels, order.bit, "reset", order.at_ns)
-            except (OSError, CommandError) as error:
-                self.log("warning", str(error))
+            self._orders.obey(*received)
