@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from pathlib import Path
 from . import death_trials, defect_trials, golden, line_trials, motion_trials, refusal_trials, restart_trials
 from .rigs import Rig
 from .station import Station, Unanswered
-from .trial import Result, Trial, Verdict, attempt
+from .trial import TRIES, Result, Trial, Verdict, attempt
 
 TRIALS: tuple[Trial, ...] = (
     *line_trials.TRIALS,
@@ -70,7 +71,7 @@ def _results(subject: Subject, full: bool, only: Sequence[str]) -> Iterator[Resu
             if station is None:
                 try:
                     station = Station(subject.rig, folder=subject.folder)
-                    line_trials.prepare(station)
+                    _prepare(station)
                 except (OSError, RuntimeError) as error:
                     yield _no_start(trial, error)
                     return
@@ -86,6 +87,18 @@ def _results(subject: Subject, full: bool, only: Sequence[str]) -> Iterator[Resu
         if station is not None:
             with contextlib.suppress(OSError):
                 station.close()
+
+
+def _prepare(station: Station) -> None:
+    """Bring axes to where trials begin; again after calm if the device falls into fault by itself, as in a trial."""
+    for _ in range(TRIES - 1):
+        try:
+            return line_trials.prepare(station)
+        except OSError as error:
+            if error.errno != errno.EIO:
+                raise
+            station.settle()
+    line_trials.prepare(station)
 
 
 def _no_start(trial: Trial, error: Exception) -> Result:

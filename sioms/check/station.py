@@ -40,7 +40,7 @@ MOVED_S = 0.05
 LOGGED_S = 1.0
 """Longest time until the daemon has written down what a driver has told it; the node shows it at once [s]."""
 LONGEST_PERIOD_S = 0.02
-"""Longest time between two looks at what is waited for [s]."""
+"""Longest time between two looks at what is waited for, unless its caller looks more rarely [s]."""
 PRIORITY = 15
 """Of simulators and wires, where real-time priorities are allowed; the drivers' lies above."""
 
@@ -54,6 +54,7 @@ class Peer:
 
     Attributes:
         port: that it told.
+        pid: of the process.
     """
 
     def __init__(self, command: Sequence[str], what: str, folder: Path | None = None) -> None:
@@ -63,6 +64,7 @@ class Peer:
             env={**os.environ, "PYTHONUNBUFFERED": "1"}, bufsize=0,
             preexec_fn=ends_with_us(),
         )  # fmt: skip
+        self.pid = self._process.pid
         self._rest = b""
         try:
             line = self._line(START_S)
@@ -191,6 +193,17 @@ class Station:
             command += ["--device", self.simulator.port, "--link", str(self._folder / "port")]
             self.wires.append(Peer(command, "wire"))
         self.port = self.wires[0].port
+
+    def processes(self) -> dict[str, int]:
+        """Return the ids of the processes that a trial needs, by what they are."""
+        found = {"the check": os.getpid()}
+        if self.daemon is not None:
+            found["the daemon"] = self.daemon.process.pid
+            with contextlib.suppress(OSError):  # it has ended, or hangs
+                found["the driver"] = self.status()["pid"]
+        peers = {"the simulator": self.simulator, **{f"wire {i + 1}": wire for i, wire in enumerate(self.wires)}}
+        found.update((what, peer.pid) for what, peer in peers.items() if peer is not None)
+        return {what: pid for what, pid in found.items() if pid}
 
     @property
     def baud(self) -> float:
@@ -491,5 +504,5 @@ def wait_for(condition: Callable[[], Any], timeout_s: float, period_s: float = 0
     """
     began = time.monotonic()
     while not (found := condition()) and (passed_s := time.monotonic() - began) < timeout_s:
-        time.sleep(period_s and min(max(period_s, 0.05 * passed_s), LONGEST_PERIOD_S))
+        time.sleep(period_s and max(period_s, min(0.05 * passed_s, LONGEST_PERIOD_S)))
     return found

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
+from .held_up import Waits
 from .station import Station, Unanswered
 
 
@@ -42,7 +43,8 @@ class NotApplicable(Exception):
 
 
 TRIES = 3
-"""Of a trial that was disturbed; what disturbed it is told also when a later one passes."""
+"""Of a trial that was disturbed, by its device or by a machine that held up what it needs; what disturbed it is told
+also when a later one passes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,21 +112,30 @@ def attempt(trial: Trial, station: Station, full: bool) -> Result:
         traffic = _traffic(station) if error.traffic is None else error.traffic
         return result(Verdict.FAILED, error.seen, error.expected, traffic)
     except (OSError, Unanswered, RuntimeError) as error:  # a time-out is an OSError
-        what = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-        return result(Verdict.FAILED, what, "the trial to end by itself", _traffic(station))
+        return result(Verdict.FAILED, _seen(error), "the trial to end by itself", _traffic(station))
     return result(Verdict.PASSED, seen)
 
 
 def _run(trial: Trial, station: Station, full: bool) -> str:
     """Run a trial, again after calm where it was disturbed."""
-    disturbed = ""
+    told = ""
     for _ in range(TRIES - 1):
+        waits = Waits(station.processes())
         try:
-            return trial.run(station, full) + disturbed
-        except Disturbed as error:
-            disturbed += f"; tried again after {error.seen}"
-            station.settle()
-    return trial.run(station, full) + disturbed
+            return trial.run(station, full) + told
+        except (Failed, OSError, Unanswered, RuntimeError) as error:
+            held_up = waits.longest(station.processes())
+            if not (held_up or isinstance(error, Disturbed)):
+                raise
+            told += f"; tried again after {_seen(error)}" + (f" ({held_up})" if held_up else "")
+        station.settle()
+    return trial.run(station, full) + told
+
+
+def _seen(error: Exception) -> str:
+    if isinstance(error, Failed):
+        return error.seen
+    return error.strerror if isinstance(error, OSError) and error.strerror else str(error)
 
 
 def _traffic(station: Station) -> list[str]:
