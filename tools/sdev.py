@@ -66,7 +66,12 @@ def _stop(cell: Workcell, line: Line) -> None:
     """Carry out the emergency stops, which overtake everything else on the command line."""
     for target in line.targets:
         if "e" in target.flags:
-            by_any_name(target.name, lambda name: cell.emergency_stop(name.removesuffix(READONLY), "sdev -e"))
+            try:
+                by_any_name(
+                    target.name, lambda name: cell.emergency_stop(name.removesuffix(READONLY), "sdev -e", or_all=False)
+                )
+            except FileNotFoundError:  # by none of its names
+                cell.emergency_stop(target.name, "sdev -e")
 
 
 class Setter:

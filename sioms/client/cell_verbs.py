@@ -322,14 +322,29 @@ class WorkcellVerbs(Session[M]):
         await self._stop("", why)
 
     @verb
-    async def emergency_stop(self, node: str = "", why: str = "") -> None:
+    async def emergency_stop(self, node: str = "", why: str = "", *, or_all: bool = True) -> None:
         """Stop one node by its name, open or not, and latch the stop until it is reset; '' = the whole workcell.
 
         Args:
             node: a node, '' as ``emergency_stop_workcell``.
             why: for the log and for who asks why nothing moves.
+            or_all: stop the whole workcell when there is no such node: whoever stops by a wrong name, or gives the
+                reason as the name, wants less motion, not more.
+
+        Raises:
+            OSError: ENOENT there is no such node; the sentence says whether all has been stopped.
         """
-        await self._stop(node, why)
+        try:
+            await self._stop(node, why)
+        except FileNotFoundError as error:
+            if not (node and or_all):
+                raise
+            try:
+                await self._stop("", f"{why}{' ' * bool(why)}(of {node}, which there is not)")
+            except OSError:
+                raise error from None  # without the right to stop all
+            text = f"{error.strerror}; the whole workcell has been stopped instead"
+            raise OSError(error.errno, text) from None
 
     async def _stop(self, node: str, why: str) -> None:
         call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why))))

@@ -26,6 +26,9 @@ _SIGNED = ("velocity", "acceleration", "jerk", "force", "force_velocity", "force
 class UserAxisVerbs:
     """An axis of an open node, seen as ``user = direction * position + offset``.
 
+    Positions and steps are in the axis' unit (m or rad), velocities in it per second and so on, forces in N or N*m, all
+    in this view's direction. Readings raise OSError as ``read`` does (EIO the device is lost), verbs as the node's.
+
     Args:
         node: open axis node.
         axis: index of the axis in the node.
@@ -56,27 +59,27 @@ class UserAxisVerbs:
         return f"<{type(self).__name__} {self.node.name}[{channel.name!r}]{view}: {place}>"
 
     def to_node(self, user: float) -> float:
-        """Return the node's position of a user position."""
+        """Return the node's position of a user position [unit]."""
         return (number("turn a user position", user) - self.offset) * self.direction
 
     def to_user(self, position: float) -> float:
-        """Return the user position of one of the node's."""
+        """Return the user position of one of the node's [unit]."""
         return self._turn(position) + self.offset
 
     @property
     def position(self) -> float:
-        """The measured position."""
+        """The measured position [unit]."""
         return self.to_user(self.node.read().position[self.axis])
 
     @property
     def velocity(self) -> float:
-        """The measured velocity."""
+        """The measured velocity [unit/s]."""
         velocity: float = self.node.read().velocity[self.axis]
         return self.direction * velocity
 
     @property
     def force(self) -> float:
-        """The measured force or torque."""
+        """The measured force or torque [N or N*m]."""
         force: float = self.node.read().force[self.axis]
         return self.direction * force
 
@@ -91,14 +94,14 @@ class UserAxisVerbs:
         return bool(self.node.read().in_motion[self.axis])
 
     def call_here(self, user: float) -> None:
-        """Let the present place have this user coordinate; nothing moves, and no other client sees it."""
+        """Let the present place have this user coordinate [unit]; nothing moves, and no other client sees it."""
         self.offset = (
             number("call a place by a user coordinate", user) - self.direction * self.node.read().position[self.axis]
         )
 
     @verb
     async def limits(self) -> tuple[float | None, float | None]:
-        """Return the lowest and highest user position, None where there is no soft limit."""
+        """Return the lowest and highest user position [unit], None where there is no soft limit."""
         found = await AxisVerbs.limits(self.node)
         low, high = (found[name][self.axis] for name in ("position_min", "position_max"))
         ends = [None if end is None else self.to_user(end) for end in (low, high)]
@@ -108,19 +111,19 @@ class UserAxisVerbs:
     async def move(
         self, /, position: float, *, replace: bool = False, timeout: float | None = 0.0, **words: Any
     ) -> int:
-        """Append a command to a user position; the words of ``sioms.command`` in user coordinates."""
+        """Append a command to a user position [unit]; further words of ``sioms.command`` in user coordinates."""
         place = self._turn(position) if words.get("relative") else self.to_node(position)
         words = self._turned(words)
         return await AxisVerbs.move(self.node, place, self.axis, replace=replace, timeout=timeout, **words)
 
     @verb
     async def tweak(self, /, step: float, **words: Any) -> int:
-        """Append a step from where the preceding command ends."""
+        """Append a step [unit] from where the preceding command ends."""
         return await AxisVerbs.tweak(self.node, self._turn(step), self.axis, **self._turned(words))
 
     @verb
     async def jog(self, velocity: float, *, acceleration: float | None = None) -> int:
-        """Go over to a velocity; see ``AxisNode.jog``."""
+        """Go over to a velocity [unit/s], with at most so much acceleration [unit/s^2]; see ``AxisNode.jog``."""
         return await AxisVerbs.jog(self.node, self._turn(velocity), self.axis, acceleration=acceleration)
 
     @verb
@@ -154,7 +157,7 @@ class UserAxisVerbs:
 
     @verb
     async def calibrate(self, user: float) -> None:
-        """Give the present position a new value, for all clients, without motion; other axes keep theirs.
+        """Give the present position a new value [unit], for all clients, without motion; other axes keep theirs.
 
         ``call_here`` changes these coordinates alone.
         """

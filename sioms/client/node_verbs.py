@@ -218,7 +218,15 @@ class NodeVerbs(NodeCore[S]):
 
 
 class AxisVerbs(NodeVerbs[AxisSnapshot]):
-    """Axes. Positions in the channel's unit (m or rad), forces in N or N*m."""
+    """Axes. Positions and steps in the channel's unit (m or rad), velocities in it per second and so on, forces in N or
+    N*m.
+
+    Every verb raises OSError: EBADF the node is closed or was opened for reading only, EPERM the user has no right to
+    it, EIO its device is lost or its driver has ended, ETIMEDOUT the driver does not answer. An axis whose name or
+    index the node has not is EINVAL; what is neither is a TypeError.
+
+    Concurrency: any number of threads.
+    """
 
     @verb
     async def move(
@@ -242,6 +250,10 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
 
         Returns:
             The driver's tick when it was taken; ``wait_until_idle`` waits for the end of the motion.
+
+        Raises:
+            OSError: EAGAIN no room in the buffer in time; ERANGE beyond a limit; EPERM stopped, in fault or not homed;
+                EINVAL words that do not go together. Nothing has been taken then.
         """
         record = command(self.index_of(axis), position=position, **words)
         return await NodeVerbs.write(self, record, timeout, replace=replace)
@@ -250,7 +262,20 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
     async def command(
         self, /, axis: int | str = 0, *, timeout: float | None = 0.0, replace: bool = False, **words: Any
     ) -> int:
-        """Append one command to an axis, given by index or name; see ``sioms.command`` for the words."""
+        """Append one command to an axis, given by index or name; see ``sioms.command`` for the words and their units.
+
+        Args:
+            axis: index of the axis in the node, or its name.
+            timeout: how long to wait for room in the command buffer [s]; 0: not; None: for ever.
+            replace: instead of what the axis does and of all that waits.
+            **words: of ``sioms.command``.
+
+        Returns:
+            The driver's tick when it was taken.
+
+        Raises:
+            OSError: as of ``move``.
+        """
         return await NodeVerbs.write(self, command(self.index_of(axis), **words), timeout, replace=replace)
 
     @verb
@@ -263,21 +288,28 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
             acceleration: at most so much, for this jog alone [unit/s^2]; None: that of the axis.
 
         Jogs end with this client, however that ends; open with a lease if it may hang.
+
+        Raises:
+            OSError: as of ``move``.
         """
         words = {} if acceleration is None else {"acceleration": acceleration}
         return await AxisVerbs.command(self, axis, velocity=velocity, replace=True, **words)
 
     @verb
     async def tweak(self, /, step: float, axis: int | str = 0, **words: Any) -> int:
-        """Append a step [unit] from where the preceding command ends, so that quick tweaks add up; see ``command``."""
+        """Append a step [unit] from where the preceding command ends, so that quick tweaks add up; see ``command``.
+
+        Raises:
+            OSError: as of ``move``.
+        """
         return await AxisVerbs.command(self, axis, position=step, relative=True, **words)
 
     @verb
     async def diagnostics(self) -> dict[str, list[float]]:
         """Return what readings do not tell, one value an axis: raw and offset [unit], retries and misses.
 
-        ``raw`` is what the device counts; ``raw + offset`` is the position; ``retries`` are those of the last
-        point move, ``misses`` all since the driver started.
+        ``raw`` is what the device counts, in the axis' unit; ``raw + offset`` is the position; ``retries`` are those
+        of the last point move, ``misses`` all since the driver started.
         """
         value: dict[str, list[float]] = await self._ask(Request.GET_DIAGNOSTICS)
         return value
@@ -300,7 +332,14 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
 
     @verb
     async def synch(self, start_ns: int | None = None) -> int:
-        """Send the external synch; return the instant at which the axes start [ns, CLOCK_MONOTONIC]."""
+        """Send the external synch; return the instant at which the axes start [ns, CLOCK_MONOTONIC].
+
+        Args:
+            start_ns: that instant, on this machine's CLOCK_MONOTONIC [ns]; None: as soon as possible.
+
+        Raises:
+            OSError: ETIME the instant has passed; EINVAL it is more than 60 s away.
+        """
         there_ns = None if start_ns is None else self._there(start_ns)
         started_ns = int(await self._ask(Request.SEND_EXTERNAL_SYNCH, there_ns))
         return started_ns if self.clock is None else self.clock.here(started_ns)
@@ -315,8 +354,17 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
 
         Args:
             axis: index or name of one axis; None: all of the node.
+
+        Raises:
+            OSError: EINVAL the node has no such axis: all have then been stopped; EBADF, EIO the node is closed, or its
+                driver has gone, which halts the axes.
         """
-        await self._ask(Request.STOP, self._one(axis))
+        try:
+            which = self._one(axis)
+        except (OSError, TypeError, ValueError):
+            await self._ask(Request.STOP)  # whoever stops an axis by a wrong name wants less motion, not more
+            raise
+        await self._ask(Request.STOP, which)
 
     @verb
     async def flush(self) -> None:
@@ -325,30 +373,58 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
 
     @verb
     async def home(self, axis: int | str | None = None) -> None:
-        """Start homing one axis, given by index or name, or all of the node; ``wait_until_idle`` waits for its end."""
+        """Start homing one axis, given by index or name, or all of the node; ``wait_until_idle`` waits for its end.
+
+        Raises:
+            OSError: EINVAL no homing is configured for it; EPERM stopped or in fault.
+        """
         await self._ask(Request.HOME, self._one(axis))
 
     @verb
     async def zero(self, axis: int | str | None = None) -> None:
-        """Make the present position 0: of one axis, given by index or name, or of all of the node."""
+        """Make the present position 0, without motion, for all clients: of one axis, given by index or name, or of all
+        of the node.
+
+        Raises:
+            OSError: EBUSY an axis moves or has commands.
+        """
         await self._ask(Request.ZERO_DEVICE, self._one(axis))
 
     @verb
     async def calibrate(self, *positions: float | None) -> None:
-        """Give the present position of each axis a new value, without motion; None: it keeps the one that it has."""
+        """Give the present position of each axis a new value, without motion, for all clients.
+
+        Args:
+            *positions: one of each axis [m or rad]; None: it keeps the one that it has.
+
+        Raises:
+            OSError: EBUSY an axis moves or has commands; ERANGE the new position is beyond a limit; EINVAL another
+                number of positions than of axes.
+        """
         what = f"calibrate {self.name}"
         wanted = [None if position is None else number(what, position) for position in positions]
         await self._ask(Request.CALIBRATE_DEVICE, wanted)
 
     @verb
     async def limits(self) -> dict[str, list[float | None]]:
-        """Return the limits in force by name, one value an axis, None where there is none."""
+        """Return the limits in force by name, one value an axis, None where there is none.
+
+        They are ``position_min``, ``position_max`` [unit], ``velocity_max`` [unit/s], ``acceleration_max`` [unit/s^2],
+        ``jerk_max`` [unit/s^3] and ``force_max`` [N or N*m].
+        """
         value: dict[str, list[float | None]] = await self._ask(Request.GET_LIMITS)
         return value
 
     @verb
     async def set_limits(self, /, **limits: float | None) -> None:
-        """Narrow the limits of all axes of the node, e.g. ``position_max=0.2``."""
+        """Narrow the limits of all axes of the node, e.g. ``position_max=0.2``.
+
+        Args:
+            **limits: names and units as of ``limits``; one number for all axes, or one an axis; None: as configured.
+
+        Raises:
+            OSError: EBUSY an axis moves or has commands; ERANGE wider than configured; EINVAL there is no such limit.
+        """
         await self._ask(Request.SET_LIMITS, limits)
 
     def room(self) -> int:

@@ -6,6 +6,7 @@ import asyncio
 import errno
 import os
 import signal
+from typing import Any
 
 import pytest
 from daemon_rig import Daemon, raises
@@ -54,6 +55,14 @@ def test_a_stop_of_an_axis_that_is_none_stops_them_all(cell: sioms.Workcell) -> 
             arm[1].jog(0.05)
             with raises(errno.EINVAL, "STOP on mod0", "want indices from 0 to"):
                 arm.ioctl(Request.STOP, wrong)
+            arm.wait_until_idle(timeout=2.0)
+        named: Any = ("misspelt", errno.EINVAL, "it has"), (1.5, None, "want its index or name")
+        for wrong, number, words in named:
+            arm[0].jog(0.05)
+            arm[1].jog(0.05)
+            with pytest.raises((OSError, TypeError), match=words) as caught:
+                arm.stop(wrong)
+            assert getattr(caught.value, "errno", None) == number
             arm.wait_until_idle(timeout=2.0)
         for request in (Request.HOME, Request.ZERO_DEVICE, Request.WAIT_UNTIL_IDLE):
             with raises(errno.EINVAL, request.name, "axis 7"):

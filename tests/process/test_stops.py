@@ -153,6 +153,32 @@ def test_a_fresh_stop_while_the_daemon_hangs_stays_latched(
     cell.reset()
 
 
+@pytest.mark.parametrize("line", ["sioms stop mod0.xaxsi", "sdev -e mod0.xaxsi", "emergency_stop('the arm is stuck')"])
+def test_a_stop_by_a_name_that_no_node_has_stops_all(daemon: Daemon, cell: sioms.Workcell, line: str) -> None:
+    """A misspelt name; or the reason in its place, where `sioms.Fleet` and `sioms.emergency_stop` have it."""
+    with cell.open("mod0.xaxis", "rw") as axis, cell.open("mod1", "rw") as other:
+        for each in (axis, other):
+            each.jog(0.05)
+        if line.startswith("emergency_stop"):
+            with raises(errno.ENOENT, "no such node", "the whole workcell has been stopped"):
+                cell.emergency_stop("the arm is stuck")
+        else:
+            tool, *words = line.split()
+            module = "front" if tool == "sioms" else tool
+            program = f"import sys; from sioms.tools.{module} import main; sys.exit(main({words}))"
+            done = subprocess.run(
+                [sys.executable, "-c", program], env={**os.environ, "SIOMS_SOCKET": daemon.socket},
+                stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+            )  # fmt: skip
+            assert done.returncode == 1 and "did you mean mod0.xaxis" in done.stderr, done.stderr
+            assert "the whole workcell has been stopped" in done.stderr
+        for each in (axis, other):
+            assert each.read().status[0] & AxisStatus.EMERGENCY_STOP
+            at_rest(each, 2.0)
+    assert "which there is not" in cell.status()["stop_source"]
+    cell.reset()
+
+
 def test_a_stop_that_nobody_takes_is_an_error(start_daemon: Callable[..., Daemon]) -> None:
     daemon = start_daemon()
     with daemon.cell() as cell:
