@@ -25,6 +25,7 @@ from sioms.protocol import verbs
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.socketpath import cell_address
 
+from .client.abandoned import undoing
 from .client.cell_verbs import WorkcellVerbs
 from .client.channel import KEEPALIVE, Answer, Call, Channel
 from .client.connecting import connect_channel
@@ -149,13 +150,8 @@ class _Requests(_Waiter):
 
     def _undo(self, call: Call | None, refused: int, value: Any) -> None:
         """Undo what was done before the cancel came, or the answer reached who was cancelled: nobody else will."""
-        if call is None or refused:
-            return
-        if isinstance(call.message, verbs.Open):
-            self._channel.send(Call("close", verbs.Close(value[0])))
-        elif isinstance(call.message, verbs.ReserveMarker):
-            for token in value:
-                self._channel.send(Call("free marker", verbs.FreeMarker(token)))
+        for each in undoing(call and call.message, refused, value):
+            self._channel.send(Call("undo", each))
 
     def _cancel(self, number: int, call: Call) -> None:
         if self._futures.pop(number, None) is not None:

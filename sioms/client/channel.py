@@ -16,8 +16,9 @@ from struct import pack, unpack
 from time import monotonic
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply, encode, short_reply, value_of
-from sioms.protocol.verbs import Cancel, CancelOnHandle, FreeMarker, Keepalive, Part, ReserveMarker
+from sioms.protocol.verbs import Cancel, CancelOnHandle, Keepalive, Part
 
+from .abandoned import undoing
 from .arguments import checked, seconds
 from .shown import acknowledged_by_daemon
 
@@ -298,16 +299,15 @@ class Channel:
             self._drop(*found)
 
     def _drop(self, message: list[Any], fds: Descriptors) -> None:
-        """Let go of an answer that nobody waits for; markers that it reserved are free again."""
+        """Let go of an answer that nobody waits for, and undo what it tells of."""
         fds.close()
-        if isinstance(self._abandoned.pop(message[1]), ReserveMarker) and not message[2]:
-            for token in message[3]:
-                freeing = Call("free marker", FreeMarker(token))
-                try:
-                    self.send(freeing)
-                except OSError:
-                    return
-                self._abandoned[freeing.number] = None
+        for each in undoing(self._abandoned.pop(message[1]), message[2], message[3]):
+            undo = Call("undo", each)
+            try:
+                self.send(undo)
+            except OSError:
+                return
+            self._abandoned[undo.number] = None
 
     def send(self, call: Call) -> int:
         """Send a request; return its number."""

@@ -14,7 +14,7 @@ import socket
 import ssl
 import threading
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 from weakref import WeakSet
@@ -162,18 +162,23 @@ class ZenohLink:
             ctypes.pythonapi.Py_IncRef(ctypes.py_object(each))
 
     def _end(self) -> None:
-        """End Zenoh's session; who comes second waits for the first. What is not taken back before it is kept for ever,
-        here 8 KiB a publisher.
-        """
+        """End Zenoh's session; a second call waits for the first."""
         with self._closing:
-            if not self._session.is_closed():
-                for each in self._declared:
-                    with suppress(zenoh.ZError):
-                        each.undeclare()
-                self._session.close()  # type: ignore[no-untyped-call]
+            end_session(self._session, self._declared)
 
 
-class _Opening:
+def end_session(session: zenoh.Session, declared: Iterable[Any]) -> None:
+    """End a session of Zenoh that has not ended yet, and first take back what it has declared: what is not, Zenoh keeps
+    as long as the process runs, 8 KiB a publisher.
+    """
+    if not session.is_closed():
+        for each in declared:
+            with suppress(zenoh.ZError):
+                each.undeclare()
+        session.close()  # type: ignore[no-untyped-call]
+
+
+class Opening:
     """Sessions that threads are opening: the program's end waits for them, and there are no more after it. A thread
     that came out of Zenoh into an interpreter that has ended would be cut off in the midst of its work.
 
@@ -212,7 +217,7 @@ class _Opening:
             self._changed.wait_for(lambda: not self._count, OPENED_S)
 
 
-_opening = _Opening()
+_opening = Opening()
 atexit.register(lambda: _opening.end())
 _open: WeakSet[ZenohLink] = WeakSet()
 _users: set[int] = set()
@@ -222,7 +227,7 @@ _users: set[int] = set()
 def _leave_all() -> None:
     """Leave the links of the parent to it, in a forked child: what ends one would wait for threads of the parent."""
     global _opening
-    _opening = _Opening()
+    _opening = Opening()
     for each in list(_open):
         each.leave()
 

@@ -30,7 +30,7 @@ def slow(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 
 def test_the_end_of_a_program_waits_for_who_opens_a_session_and_has_it_closed(slow: SimpleNamespace) -> None:
-    opening, said = zenoh_link._Opening(), list[object]()
+    opening, said = zenoh_link.Opening(), list[object]()
     how: Any = None
 
     def opens() -> None:
@@ -58,7 +58,7 @@ def test_the_end_of_a_program_waits_for_who_opens_a_session_and_has_it_closed(sl
 
 
 def test_sessions_are_opened_side_by_side(slow: SimpleNamespace) -> None:
-    opening, opened = zenoh_link._Opening(), list[object]()
+    opening, opened = zenoh_link.Opening(), list[object]()
     how: Any = None
     threads = [threading.Thread(target=lambda: opened.append(opening.open(how))) for _ in range(3)]
     for thread in threads:
@@ -81,10 +81,7 @@ def test_a_link_takes_back_what_it_has_declared_before_its_session_ends() -> Non
 
         return SimpleNamespace(undeclare=undeclare)
 
-    ended: Any = zenoh_link.ZenohLink.__new__(zenoh_link.ZenohLink)
-    ended._closing = threading.Lock()
-    ended._declared = [part(name) for name in ("subscriber", "token", "publisher")]
-    ended._session = SimpleNamespace(is_closed=lambda: "session" in said, close=lambda: said.append("session"))
-    ended._end()
-    ended._end()
+    session: Any = SimpleNamespace(is_closed=lambda: "session" in said, close=lambda: said.append("session"))
+    for _ in range(2):
+        zenoh_link.end_session(session, [part(name) for name in ("subscriber", "token", "publisher")])
     assert said == ["subscriber", "token", "publisher", "session"]
