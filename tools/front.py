@@ -11,12 +11,14 @@ import errno
 import os
 import signal
 import sys
+import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, NoReturn
 
+from sioms.ending import leave
 from sioms.safe_path import leave_working_directory
 
 
@@ -95,9 +97,13 @@ def main(words: Sequence[str] | None = None) -> int:
         return answer("sioms", "version")
     if as_program and signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # the command may have something to put in order
+    if as_program and wanted in LEAVES:
+        _run_and_leave(wanted, module, args)
     return _guarded(wanted, module, args)
 
 
+LEAVES = ("serve",)
+"""Commands whose libraries keep threads that would run on while the interpreter ends, whatever ends the command."""
 EXTRAS = {
     "bluesky": "bluesky", "cryptography": "net", "gpiod": "gpio", "matplotlib": "report", "mfusepy": "mount",
     "numba": "fast", "p4p": "epics", "prometheus_client": "metrics", "pyarrow": "parquet", "zenoh": "net",
@@ -172,6 +178,16 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
             text = f"{error.filename}: {text.lower()}"
         print(f"sioms {name}: {text}", file=sys.stderr)
         return 1
+
+
+def _run_and_leave(name: str, module: Any, args: argparse.Namespace) -> NoReturn:
+    """Run a command, and leave whatever ended it, a mistake of ours, too."""
+    status = 1
+    try:
+        status = _guarded(name, module, args)
+    except Exception:
+        traceback.print_exc()
+    leave(status)
 
 
 def _lacks(name: str, error: ModuleNotFoundError) -> int:

@@ -14,7 +14,6 @@ from sioms.arguments import place
 from sioms.client.keys import Folder
 from sioms.client.places import place_of
 from sioms.documents import json_text
-from sioms.ending import leave
 from sioms.protocol.socketpath import socket_path
 
 PLACE, ZENOH_PLACE = "127.0.0.1:5770", "127.0.0.1:5780"
@@ -66,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     folder = Folder(args.keys)
     if args.command == "serve":
         _serve(args, folder)
-        leave()
+        return 0
     match args.verb:
         case "new":
             pair = folder.new(args.name or getpass.getuser())

@@ -46,6 +46,36 @@ leave(3)
 """
 
 
+FRONT = """
+import atexit, sys
+from types import SimpleNamespace
+from sioms.gateway import command
+from sioms.tools import front
+def fails(args):
+    raise {error}
+command.run = fails
+atexit.register(print, "taken apart")
+sys.argv = ["sioms", "{name}", {more}]
+front.main()
+"""
+
+
+@pytest.mark.parametrize("error", ['OSError(98, "in use")', 'RuntimeError("a mistake")'])
+def test_a_gateway_that_fails_leaves_too(error: str) -> None:
+    """Zenoh's own threads are never ended; they would run on while interpreter and libraries are taken apart."""
+
+    def run(name: str, more: str) -> tuple[int, str, str]:
+        program = FRONT.format(error=error, name=name, more=more)
+        found = subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, timeout=30.0, check=False
+        )
+        return found.returncode, found.stdout, found.stderr
+
+    status, out, said = run("serve", "")
+    assert status == 1 and not out and ("in use" in said or "a mistake" in said)
+    assert run("key", "'list'")[1] == "taken apart\n" and not out, "other commands end as programs do"
+
+
 def test_who_leaves_has_written_all_and_runs_nothing_more() -> None:
     found = subprocess.run([sys.executable, "-c", LEAVES], capture_output=True, text=True, timeout=30.0, check=False)
     assert found.stdout == "said" and found.returncode == 3
