@@ -262,6 +262,9 @@ def _compare(
     """Compare what drivers took for the deaths of clients with what an observer took."""
     if stops:
         return  # a client that is stopped does not end: it is its lease that does
+    if seen.unlike:
+        tally.notes.append(f"a round is not compared with its observer: {seen.unlike}")
+        return
     for axis, halt in halts.items():
         pid, begin = of[axis]
         if not halt or pid not in seen.ended_ns:

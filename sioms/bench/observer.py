@@ -22,10 +22,12 @@ class Seen(NamedTuple):
     Attributes:
         ended_ns: when it heard of the end of each process [CLOCK_MONOTONIC].
         late_ns: how late it woke at most of waits for TICK_S, since it began to watch.
+        unlike: why it was not in the scheduling class that it was to have; '': it was.
     """
 
     ended_ns: Mapping[int, int]
     late_ns: int
+    unlike: str = ""
 
 
 class Observer:
@@ -53,8 +55,8 @@ class Observer:
 
     def seen(self) -> Seen:
         """Return what it has seen, and watch no more."""
-        ended, late_ns = self._told(None)
-        return Seen({int(pid): ns for pid, ns in ended.items()}, late_ns)
+        ended, late_ns, unlike = self._told(None)
+        return Seen({int(pid): ns for pid, ns in ended.items()}, late_ns, unlike)
 
     def _told(self, what: object) -> Any:
         os.write(self._ask, json.dumps(what).encode() + b"\n")
@@ -70,10 +72,10 @@ class Observer:
 def _observe(asks: int, answers: int) -> None:
     while asked := _line(asks):
         pids, like = json.loads(asked)
-        _be_like(like)
+        unlike = _be_like(like)
         ended, late_ns = _watch(pids, asks, answers)
         _line(asks)
-        os.write(answers, json.dumps([ended, late_ns]).encode() + b"\n")
+        os.write(answers, json.dumps([ended, late_ns, unlike]).encode() + b"\n")
 
 
 def _line(fd: int) -> bytes:
@@ -86,14 +88,15 @@ def _line(fd: int) -> bytes:
     return text
 
 
-def _be_like(pid: int) -> None:
-    """Take the scheduling class of a process, as far as we may."""
+def _be_like(pid: int) -> str:
+    """Take the scheduling class of a process; return why that failed, '' when it did not."""
     try:
         policy = os.sched_getscheduler(pid) & ~os.SCHED_RESET_ON_FORK
         os.sched_setscheduler(0, policy, os.sched_getparam(pid))
         os.setpriority(os.PRIO_PROCESS, 0, os.getpriority(os.PRIO_PROCESS, pid))
-    except OSError:
-        return  # it has ended, or we may not
+    except OSError as error:  # it has ended, or we may not
+        return f"take the scheduling class of process {pid}: {(error.strerror or str(error)).lower()}"
+    return ""
 
 
 def _watch(pids: list[int], asks: int, answers: int) -> tuple[dict[int, int], int]:
