@@ -36,6 +36,7 @@ import numpy as np
 from sioms.kinematics import Joint, Reach, Transform, forces
 from sioms.motion import AxisBank, AxisKind, AxisSettings, CommandError
 from sioms.motion.axis_step import FORCE, HOLD, SETTLING, STOP
+from sioms.motion.settings import EVERY_MODE
 from sioms.protocol.flags import AxisStatus, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import WRITE
@@ -47,7 +48,7 @@ from sioms.sdk.tables import from_table, table_type
 
 from .readings import LATCHED, Past, Reading, Readings
 
-MODES = ControlMode(0x7FFF) & ~(
+MODES = EVERY_MODE & ~(
     ControlMode.FORCE
     | ControlMode.FORCE_VELOCITY
     | ControlMode.SPECIFIED_GAINS

@@ -16,6 +16,7 @@ import numpy as np
 from msgspec import Meta
 
 from sioms.motion import AxisKind, AxisSettings
+from sioms.motion.settings import EVERY_MODE
 from sioms.plant.binary import Box
 from sioms.plant.effects import Effect, build_effects, parse_effects
 from sioms.plant.foreign import Laws, TwinAxes, twin
@@ -27,7 +28,6 @@ from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.sdk.blocks import BlockSpec, Description
 from sioms.sdk.tables import from_table, table_type
 
-ALL_MODES = ControlMode(0x7FFF)
 FORCE_MODES = (
     ControlMode.FORCE
     | ControlMode.FORCE_VELOCITY
@@ -216,8 +216,8 @@ def _model_sum(axis: Any) -> str:
 def _axis_settings(axis: Any, tick_s: float) -> AxisSettings:
     """Return the bank's settings; a servo without gains gets those of its bandwidth."""
     if axis.stepper is not None:
-        return from_table(AxisSettings, axis, {"kind": AxisKind.STEPPER, "modes": ALL_MODES & ~FORCE_MODES})
-    settings = from_table(AxisSettings, axis, {"kind": AxisKind.SERVO, "modes": ALL_MODES})
+        return from_table(AxisSettings, axis, {"kind": AxisKind.STEPPER, "modes": EVERY_MODE & ~FORCE_MODES})
+    settings = from_table(AxisSettings, axis, {"kind": AxisKind.SERVO, "modes": EVERY_MODE})
     if settings.k is not None:
         return settings
     k, kz = _gains(axis, tick_s)
@@ -252,10 +252,10 @@ def _axis_channel(axis: Any) -> ChannelInfo:
     limits = {"velocity": axis.velocity_max, "acceleration": axis.acceleration_max}
     if axis.jerk_max is not None:
         limits["jerk"] = axis.jerk_max
-    modes = ALL_MODES & ~FORCE_MODES
+    modes = EVERY_MODE & ~FORCE_MODES
     if axis.stepper is None:
         limits["force"] = axis.force_max
-        modes = ALL_MODES
+        modes = EVERY_MODE
     return ChannelInfo(
         axis.name, axis.unit, axis.position_min, axis.position_max, 0, int(modes), limits, axis.description
     )  # fmt: skip

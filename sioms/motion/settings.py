@@ -11,7 +11,7 @@ from sioms.protocol.flags import ControlMode
 SWITCH_MINUS, SWITCH_PLUS, SWITCH_HOME = 1, 2, 4
 """Bits of an axis in the ``switches`` argument of AxisBank.tick()."""
 HOME_SWITCHES = {"minus": SWITCH_MINUS, "plus": SWITCH_PLUS, "home": SWITCH_HOME}
-EVERY_MODE = ControlMode(0x7FFF)
+EVERY_MODE = ControlMode(sum(ControlMode))
 RESTORE = ("matching", "always")
 
 
