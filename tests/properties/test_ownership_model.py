@@ -27,6 +27,7 @@ from sioms.protocol.latch import Latch
 from sioms.protocol.messages import ClientVerb
 from sioms.protocol.stopjournal import StopJournal, node_entry
 from sioms.sdk.blocks import AxisBlock
+from sioms.sdk.handles import Handle
 
 DEPTH = int(os.environ.get("SIOMS_EXPLORE_DEPTH", "1"))
 """Steps from each beginning; a deeper exploration takes hours, see tests/ownership_explorer.py."""
@@ -156,6 +157,25 @@ def test_a_stop_in_the_middle_of_the_reset_of_a_node_is_kept_or_undone_but_never
             cell.take(("bury", device, "process"))
             cell.take(("start", device))
             assert _is_stopped(cell, device) or not stopped, place
+
+
+def test_a_stop_that_comes_between_taking_a_request_and_serving_it_holds() -> None:
+    """It has been acknowledged before the request is served, so nothing may move after that."""
+    with cells() as make, pytest.MonkeyPatch.context() as patch:
+        cell = make()
+        for action in [*begin("nobody owns anything"), ("open", 0, 0), ("hear", 0)]:
+            cell.take(action)
+        take = Handle.take
+
+        def taken(of: Handle, most: int) -> tuple[bytes, bool]:
+            found = take(of, most)
+            assert cell.stop_node(1, 0) == "done"
+            return found
+
+        patch.setattr(Handle, "take", taken)
+        assert cell.move(0, 0) == "refused"
+        patch.undo()
+        assert _is_stopped(cell, 0)
 
 
 def test_what_could_not_be_reset_is_stopped_when_its_driver_starts_again() -> None:
