@@ -42,16 +42,17 @@ def _work(words: Sequence[str]) -> None:
         raise UsageError(f"-{actions[0]}: no marker given")
     cell = Workcell(name="smarkers")
     deadline = None if timeout_s is None else monotonic() + timeout_s
+    left = timeout_s  # of the first wait it is all, as the user has given it
     act: dict[str, Callable[[int], object]] = {
         "f": cell.free_marker,
         "s": cell.signal_marker,
-        "w": lambda token: cell.wait_marker(
-            token, None if deadline is None else max(0.0, round(deadline - monotonic(), 3))
-        ),
+        "w": lambda token: cell.wait_marker(token, left),
     }
     for action in actions:
         for token in numbers:
             act[action](token)
+            if deadline is not None:
+                left = max(0.0, round(deadline - monotonic(), 3))
 
 
 def _read(words: Sequence[str]) -> tuple[list[str], list[int], float | None]:

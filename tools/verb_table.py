@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 
 from sioms.protocol.driver_verbs import FROM_DRIVER, TO_DRIVER, TO_FORK_SERVER
-from sioms.protocol.flags import REQUESTS, Request, Right
+from sioms.protocol.flags import OF_SOME_AXES, REQUESTS, Request, Right
 from sioms.protocol.verbs import FROM_CLIENT, ON_HANDLE, Message, Socket
 
 SOCKETS = {
@@ -103,5 +103,6 @@ def _requests() -> list[str]:
     ]
     for number, (right, owns, looks, does) in REQUESTS.items():
         owner, shown = "yes" if owns else "", "" if looks else "yes"
+        does += " (*)" if number in OF_SOME_AXES else ""
         lines.append(f"| {int(number)} | {Request(number).name} | {_words(right)} | {owner} | {shown} | {does} |")
     return [*lines, ""]

@@ -175,8 +175,8 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
         False,
         "define the present positions, one an axis; nil: an axis keeps the one that it has",
     ),
-    Request.ZERO_DEVICE: (Right.WRITE, True, False, "define the present position or reading as 0 (*)"),
-    Request.WAIT_UNTIL_IDLE: (Right.READ, False, True, "wait until axes are at rest and their buffers are empty (*)"),
+    Request.ZERO_DEVICE: (Right.WRITE, True, False, "define the present position or reading as 0"),
+    Request.WAIT_UNTIL_IDLE: (Right.READ, False, True, "wait until axes are at rest and their buffers are empty"),
     Request.SEND_EXTERNAL_SYNCH: (Right.WRITE, False, False, "start all commands that wait for the external synch"),
     Request.EMERGENCY_STOP: (Right.STOP, False, False, "stop the node until it is reset"),
     Request.SIGNAL_MARKER: (Right.WRITE, False, False, "signal a marker; passed on to the daemon"),
@@ -191,9 +191,9 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
     ),
     Request.SET_GAINS: (Right.WRITE, True, False, "set the gain matrix"),
     Request.GET_GAINS: (Right.READ, False, True, "return the gain matrix"),
-    Request.STOP: (Right.STOP | Right.WRITE, False, False, "stop at maximum deceleration and empty the buffers (*)"),
+    Request.STOP: (Right.STOP | Right.WRITE, False, False, "stop at maximum deceleration and empty the buffers"),
     Request.RESET: (Right.WRITE | Right.ADMINISTER, False, False, "clear stops and faults of the node"),
-    Request.HOME: (Right.WRITE, True, False, "start homing (*)"),
+    Request.HOME: (Right.WRITE, True, False, "start homing"),
     Request.SET_LIMITS: (Right.WRITE, True, False, "set limits, within the configured ones"),
     Request.GET_LIMITS: (Right.READ, False, True, "return the limits in force"),
     Request.FLUSH: (Right.WRITE, True, False, "empty the buffers; the running command continues"),
@@ -203,6 +203,10 @@ REQUESTS: dict[int, tuple[Right, bool, bool, str]] = {
 }
 """The table of requests: any of which rights it takes; whether it needs the output node itself, not its read-only
 companion; whether it only looks (else a reading after the answer shows its effect); what it does.
+"""
+OF_SOME_AXES = (Request.ZERO_DEVICE, Request.WAIT_UNTIL_IDLE, Request.STOP, Request.HOME)
+"""Requests whose argument may be the index of an axis in the node, or a list of indices; without one they concern all
+axes.
 """
 
 

@@ -154,7 +154,7 @@ READING = ("_read", "_packet", "_decoded", "_fds_of", "_last_word")
 """An answer that a signal takes out of the hand that has just read it is lost; markers end with the session."""
 
 
-def _markers(cells: dict[str, str], watch: dict[str, sioms.Workcell]) -> int:
+def _markers(watch: dict[str, sioms.Workcell]) -> int:
     """Return how many markers the sessions of all cells have."""
     return sum(row[3] for cell in watch.values() for row in cell.status()["sessions"])
 
@@ -162,10 +162,10 @@ def _markers(cells: dict[str, str], watch: dict[str, sioms.Workcell]) -> int:
 def test_an_interrupt_between_cells_leaves_nothing_behind(fleet: sioms.Fleet, cells: dict[str, str]) -> None:
     watch = {name: sioms.Workcell(address, "watch") for name, address in cells.items()}
     try:
-        before, places = _markers(cells, watch), 0
+        before, places = _markers(watch), 0
         for at in interrupted_everywhere(fleet.reserve_marker, BETWEEN_CELLS, READING, step=7):
             fleet.status()  # who reads next finds what nobody waits for
-            wait_for(lambda: _markers(cells, watch) == before, f"no marker left of place {at}", 2.0)
+            wait_for(lambda: _markers(watch) == before, f"no marker left of place {at}", 2.0)
             places = at
         assert places > 20
     finally:

@@ -408,7 +408,7 @@ def test_monitor_jogs_while_a_key_repeats_and_no_longer(monitor: MonitorTerminal
 def test_waits_of_sdev_and_smarkers_end(shell: Shell, cell: sioms.Workcell) -> None:
     token = good(shell("smarkers -r")).strip()
     began = time.monotonic()
-    refused(shell(f"smarkers -w -t0.2 {token}"), "wait for marker", "not within 0.")
+    refused(shell(f"smarkers -w -t0.2 {token}"), "wait for marker", "not within 0.2 s")
     with cell.open("mod0.xaxis", "rw") as axis:
         axis.command(velocity=0.01)
         refused(shell("sdev -w -t0.2 mod0.xaxis"), "not within")

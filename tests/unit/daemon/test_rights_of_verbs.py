@@ -157,6 +157,9 @@ class Workcell:
         self.requests.nodes.detached(self.device, number)  # type: ignore[arg-type]
 
     def close(self) -> None:
+        for session in self.sessions.values():
+            if session.leash is not None:
+                session.leash.cut()
         for each in (*self.ends.values(), *(s.sock for s in self.sessions.values())):
             each.close()
         os.close(self.device.page_fds[0])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -35,6 +36,7 @@ def ends() -> Iterator[SimpleNamespace]:
     sock = context.socket(zmq.ROUTER)
     found = Stops(context, sock, "/nowhere", lambda _: KATE, Inflow(), lambda *words, **more: said.append(str(more)))
     yield SimpleNamespace(stops=found, said=said)
+    found.close()
     context.destroy(0)
 
 
@@ -85,7 +87,7 @@ def test_a_mistake_of_ours_does_not_end_the_thread(ends: SimpleNamespace) -> Non
 
 
 @pytest.fixture
-def request_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StopRequest:
+def request_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StopRequest]:
     """The stop-request file of a daemon that takes the sessions for stops, and does nothing else."""
     for name in ("stop", "stopped"):
         (tmp_path / name).write_bytes(bytes(8))
@@ -97,7 +99,8 @@ def request_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StopRequest
     monkeypatch.setattr(ways, "connect", lambda _: None)
     monkeypatch.setattr(ways, "Channel", type("Channel", (), {"__init__": lambda *_: None, "call": call,
                                                               "close": lambda _: None}))  # fmt: skip
-    return StopRequest(*(os.open(tmp_path / name, os.O_RDONLY) for name in ("stop", "stopped")))
+    with closing(StopRequest(*(os.open(tmp_path / name, os.O_RDONLY) for name in ("stop", "stopped")))) as found:
+        yield found
 
 
 def _frame(stop: EmergencyStop) -> bytes:
