@@ -150,7 +150,7 @@ class _Requests(_Waiter):
 
     def _undo(self, call: Call | None, refused: int, value: Any) -> None:
         """Undo what was done before the cancel came, or the answer reached who was cancelled: nobody else will."""
-        for each in undoing(call and call.message, refused, value):
+        for each in undoing(None if call is None else call.message, refused, value):
             self._channel.send(Call("undo", each))
 
     def _cancel(self, number: int, call: Call) -> None:
