@@ -46,7 +46,7 @@ class Came(NamedTuple):
     """How a packet came.
 
     Args:
-        resets: how many resets had been seen when it was sent, at least; UNKNOWN: it lay there when one was seen.
+        resets: how many resets had been seen when it was sent, at least; UNKNOWN: it may be older.
         timestamp_ns: of the kernel [ns, CLOCK_REALTIME].
     """
 
@@ -155,7 +155,7 @@ class Attachments:
         )  # fmt: skip
         self.handles[number] = handle
         if self._service.stops.resets.count:  # its client may have used it for long already
-            handle.note_reset()
+            handle.note_reset(0)
         if exclusive:
             self._owners |= dict.fromkeys((sock.fileno(), *([handle.pidfd] if handle.pidfd >= 0 else [])), handle)
         if lease_ns:
@@ -177,11 +177,12 @@ class Attachments:
         try:
             packet, timestamp_ns = receive(handle.sock, MAX_PACKET + 1)
         except BlockingIOError:
-            handle.queued_bytes = 0
+            handle.took(0)
             return
         except OSError:
             packet, timestamp_ns = b"", 0
-        came = Came(UNKNOWN if handle.was_queued(len(packet)) else resets, timestamp_ns)
+        came = Came(UNKNOWN if handle.is_in_doubt else resets, timestamp_ns)
+        handle.took(len(packet))
         handle.hear(time.monotonic_ns())
 
         def serve() -> None:
@@ -277,7 +278,10 @@ class Attachments:
         if came.resets == resets.count:
             return False
         reset_ns = resets.latest_ns(handle.block, concerned(handle, message), handle.number)
-        return self.timestamps.monotonic_ns(came.timestamp_ns) < reset_ns
+        sent_ns = self.timestamps.monotonic_ns(came.timestamp_ns)
+        if handle.passed_on:  # a gateway has received it before, and has told when it was sent at the earliest
+            sent_ns = min(sent_ns, handle.heard_ns)
+        return sent_ns < reset_ns
 
     def _note(self, handle: Handle, packet: bytes, errno_: int, why: str) -> None:
         """Note a command, after its answer has been sent: a client does not wait for that."""

@@ -88,6 +88,7 @@ class Handle:
         axes: ``channels`` as plain integers.
         halted: whether what it owns has been stopped because it ends.
         queued_bytes: how much of what lay in its socket when a reset was seen lies there still.
+        reset_ns: when what it shows was reset last [ns, CLOCK_MONOTONIC].
         stale_write: number of a write some records of which were sent before a reset.
     """
 
@@ -118,6 +119,7 @@ class Handle:
     ahead: tuple[int, list[bytes]] = (0, [])
     halted: bool = False
     queued_bytes: int = 0
+    reset_ns: int = 0
     stale_write: int = -1
     writes: bool = field(init=False)
     axes: list[int] = field(init=False)
@@ -126,17 +128,23 @@ class Handle:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
         self.axes = self.channels.tolist()
 
-    def note_reset(self) -> None:
-        """Note that what it shows has been reset: of what lies in its socket it matters when that was sent."""
+    def note_reset(self, at_ns: int) -> None:
+        """Note that what it shows has been reset [ns, CLOCK_MONOTONIC]: of what comes from before it matters when that
+        was sent.
+        """
+        self.reset_ns = max(self.reset_ns, at_ns)
         if self.ahead[1]:
             self.stale_write, self.ahead = self.ahead[0], (0, [])
         self.queued_bytes = pending_bytes(self.sock)
 
-    def was_queued(self, size: int) -> bool:
-        """Return whether a packet of so many bytes that has been received lay there when a reset was seen."""
-        was_queued = self.queued_bytes > 0
+    @property
+    def is_in_doubt(self) -> bool:
+        """Whether what comes next may have been sent before a reset: it lay there, or was under way on a network."""
+        return self.queued_bytes > 0 or (self.passed_on and self.heard_ns < self.reset_ns)
+
+    def took(self, size: int) -> None:
+        """Note that a packet of so many bytes has been received; 0: there was none."""
         self.queued_bytes = max(0, self.queued_bytes - size) if size else 0
-        return was_queued
 
     def hear(self, now_ns: int) -> None:
         """Note that a packet of the client has come [ns, CLOCK_MONOTONIC]."""

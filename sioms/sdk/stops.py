@@ -213,7 +213,7 @@ class Stops:
         if ended_ns != before_ns:
             self.resets.note_all(latch.reset_ns)
             for handle in self._handles.values():
-                handle.note_reset()
+                handle.note_reset(latch.reset_ns)
         else:  # the workcell was not stopped: of what its nodes are
             for block in self._blocks:
                 self._note_reset(block, self._stopped_of(block, range(block.n), -1), latch.reset_ns)
@@ -227,7 +227,7 @@ class Stops:
         reset = {channel for channel, _ in stopped}
         for handle in self._handles.values():
             if handle.block is block and not reset.isdisjoint(handle.axes) and handle.number != by:
-                handle.note_reset()
+                handle.note_reset(at_ns)
 
     def _stopped_of(self, block: AnyBlock, channels: Iterable[int], bit: int) -> list[tuple[int, int]]:
         """Return which parts of some channels are stopped or in fault, by themselves."""

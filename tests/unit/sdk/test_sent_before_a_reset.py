@@ -15,7 +15,7 @@ from sioms.drivers.sim.io import SimIo
 from sioms.protocol.driver_verbs import DriverVerb
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.records import AXIS_WRITE, WRITE, WRITE_STRUCT
-from sioms.protocol.verbs import Part, Write
+from sioms.protocol.verbs import Heard, Part, Write
 
 AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "motor": {"mass": 1.0}, "force_max": 60.0}
 LATER_NS = 1_000_000
@@ -323,3 +323,20 @@ def test_a_client_that_leaves_takes_its_waiting_write_along(line: World) -> None
     for _ in range(200):
         line.turn(calm=True)
     assert line.device is not None and line.device.outputs == 0
+
+
+def test_what_was_under_way_on_a_network_is_of_before_and_what_knows_of_the_reset_is_not(axes: World) -> None:
+    """A gateway says when its client sent something at the earliest: the word of the gateway that that repeats."""
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    sock, before_ns = owner.client.channel._sock, CLOCK()
+    sock.send(Heard(before_ns).packed())
+    owner.jog()
+    assert owner.served() == [None]
+    _stop_and_reset(axes, [0])
+    axes.runtime.heed()
+    axes.tick()
+    owner.jog()  # passed on by now, and as old as the last one
+    assert owner.served() == [None, errno.ECANCELED]
+    sock.send(Heard(CLOCK()).packed())
+    owner.jog()
+    assert owner.served() == [None, errno.ECANCELED, None]
