@@ -168,20 +168,23 @@ def test_a_link_that_delays_serves_and_one_that_doubles_ends_with_a_sentence(dae
 def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
     daemon: Daemon, gate: Gateway, cell: sioms.Workcell, node: str
 ) -> None:
-    with Relay(gate.port) as relay, sioms.Workcell(gate.trusted(relay.port), "far") as far:
-        with far.open("mod1", "rw", lease=10.0) as axis:
-            axis.command(velocity=0.01)
-            relay.treat(stalled=True)
-            writing = Waiting(lambda: axis.command(velocity=0.05))
-            time.sleep(0.1)
+    with (
+        Relay(gate.port) as relay,
+        sioms.Workcell(gate.trusted(relay.port), "far") as far,
+        far.open("mod1", "rw", lease=10.0) as axis,
+    ):
+        axis.command(velocity=0.01)
+        relay.treat(stalled=True)
+        writing = Waiting(lambda: axis.command(velocity=0.05))
+        time.sleep(0.1)
+        cell.emergency_stop(node)
+        cell.reset(node)
+        relay.treat()
+        assert writing.errno() == errno.ECANCELED
+        for _ in range(20):
             cell.emergency_stop(node)
-            cell.reset(node)
-            relay.treat()
-            assert writing.errno() == errno.ECANCELED
-            for _ in range(20):
-                cell.emergency_stop(node)
-                far.reset(node)
-                axis.command(velocity=0.01)  # who knows of the reset is not refused
+            far.reset(node)
+            axis.command(velocity=0.01)  # who knows of the reset is not refused
 
 
 def test_a_revoked_key_is_out_at_once(daemon: Daemon, gate: Gateway, cell: sioms.Workcell) -> None:
