@@ -52,7 +52,9 @@ class Bench:
         self.drive = Simulator("modbus.simulated.leadshine", "--link", folder / "drive", "--units", "1")
         self.finger = Simulator("framed_adc.simulator", "--link", folder / "finger", "--channels", "16")
         self.block = Simulator("modbus.simulated.moxa", "--model", "E1212", "--port", "0", "--watchdog-s", "0.6")
-        text = CONFIG.read_text()
+        # A driver that gets no processor for half a second counts as hung and stops this cell, as it should. Whether
+        # the machine of the tests leaves it one is not what is tried here.
+        text = CONFIG.read_text().replace("driver = ", "lease_s = 5.0\ndriver = ")
         for name, device in (
             ("/dev/ttyUSB0", self.drive), ("/dev/ttyACM0", self.finger), ("192.168.127.254:502", self.block),
         ):  # fmt: skip
@@ -87,10 +89,16 @@ def bench(shared_bench: Bench) -> Bench:
     with shared_bench.daemon.cell() as cell:
         cell.reset()
         with cell.open("slide0", "rw", timeout=3.0) as axis:
-            axis.reset()
-            wait_for(lambda: not axis.read().status[0] & AxisStatus.FAULT, "no fault")
-            axis.move(0.0)
-            axis.wait_until_idle(10.0)
+            for left in (2, 1, 0):
+                axis.reset()
+                wait_for(lambda: not axis.read().status[0] & AxisStatus.FAULT, "no fault")
+                try:
+                    axis.move(0.0)
+                    axis.wait_until_idle(10.0)
+                    break
+                except OSError as error:
+                    if error.errno != errno.EIO or not left:
+                        raise  # else the drive's own dead-man has acted, of a driver that the machine held up
     return shared_bench
 
 
