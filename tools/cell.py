@@ -33,7 +33,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument("--json", action="store_true", help="print JSON")
     subparsers.add_parser("reload", help="make the daemon reload its configuration")
     one = subparsers.add_parser("stop", help="emergency stop, latched until `sioms reset`; not a safety-rated function")
-    one.add_argument("node", metavar="NODE", nargs="?", default="", help="a node; default: the whole workcell")
+    one.add_argument("nodes", metavar="NODE", nargs="*", help="a node; default: the whole workcell")
     one.add_argument("--all", action="store_true", help="all cells of the fleet")
     one = subparsers.add_parser(
         "wait", help="wait until the daemon is ready: all devices have started, or are in fault"
@@ -77,7 +77,7 @@ def run(args: argparse.Namespace) -> int:
         case "wait":
             _wait(args.timeout)
         case "stop":
-            _stop_all(args.node) if args.all else _stop(args.node)
+            _stop_all(args.nodes) if args.all else _stop(args.nodes)
         case "reset":
             with Workcell(name="sioms") as cell:
                 cell.reset(args.node)
@@ -115,21 +115,30 @@ def _wait(timeout_s: float) -> None:
         sleep(0.05)
 
 
-def _stop(node: str) -> None:
-    if node:
+def _stop(nodes: Sequence[str]) -> None:
+    if nodes:
+        failed: list[OSError] = []
         with Workcell(name="sioms") as cell:
-            cell.emergency_stop(node, "sioms stop")
+            for node in nodes:
+                try:
+                    cell.emergency_stop(node, "sioms stop")
+                except OSError as error:
+                    failed.append(error)
+        if failed:
+            raise failed[0]
     elif unheard := emergency_stop("sioms stop", name="sioms"):
         print(f"sioms stop: stopped and latched by the drivers; {unheard}", file=sys.stderr)
 
 
-def _stop_all(node: str) -> None:
+def _stop_all(nodes: Sequence[str]) -> None:
     from sioms.client.fleet import Fleet
 
-    if node:
-        raise OSError(errno.EINVAL, f"stop {node}: --all stops every cell as a whole; leave out one of both")
     with Fleet(name="sioms", partial=True) as fleet:
         fleet.emergency_stop("sioms stop --all")
+    if nodes:
+        raise OSError(
+            errno.EINVAL, f"stop {' '.join(nodes)}: --all has stopped every cell as a whole; leave out one of both"
+        )
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:

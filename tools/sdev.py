@@ -9,7 +9,7 @@ import errno
 
 from sioms.client.stopping import emergency_stop
 
-from .options import Line, Target, UsageError, fold
+from .options import Line, Target, UsageError, fold, is_numeric
 from .pipe import NO_NUMBER, READONLY, by_any_name, complain, open_node, read_input, run
 from .tokens import Tokens
 
@@ -28,7 +28,7 @@ def main(words: Sequence[str] | None = None) -> int:
     return run("sdev", _work, words)
 
 
-def _work(words: Sequence[str]) -> None:
+def _read(words: Sequence[str]) -> tuple[Line, Tokens]:
     line = fold("sdev", words)
     numbers = Tokens()
     if line.numbers:
@@ -36,6 +36,17 @@ def _work(words: Sequence[str]) -> None:
     if numbers.bad:
         raise UsageError(numbers.bad.partition(": ")[2])
     _check(line)
+    return line, numbers
+
+
+def _work(words: Sequence[str]) -> None:
+    try:
+        line, numbers = _read(words)
+    except UsageError as error:
+        if not any(map(_asks_to_stop, words)):
+            raise
+        emergency_stop("sdev -e", name="sdev")
+        raise UsageError(f"{error}; the whole workcell has been stopped") from None
     if not line.targets:
         if unheard := emergency_stop("sdev -e", name="sdev"):
             complain("sdev", f"stopped and latched by the drivers; {unheard}", 0)
@@ -49,6 +60,11 @@ def _work(words: Sequence[str]) -> None:
     Setter(cell, numbers, bool(line.numbers), line.common.get("t")).carry_out(
         [Target(t.name, {key: 0 for key in t.flags if key != "e"}) for t in line.targets]
     )
+
+
+def _asks_to_stop(word: str) -> bool:
+    """Tell whether a word of a command line that cannot be read asks for an emergency stop."""
+    return word == "--emergency-stop" or (word[:1] == "-" and word[1:2] != "-" and "e" in word and not is_numeric(word))
 
 
 def _check(line: Line) -> None:

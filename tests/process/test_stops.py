@@ -175,8 +175,38 @@ def test_a_stop_by_a_name_that_no_node_has_stops_all(daemon: Daemon, cell: sioms
         for each in (axis, other):
             assert each.read().status[0] & AxisStatus.EMERGENCY_STOP
             at_rest(each, 2.0)
-    assert "which there is not" in cell.status()["stop_source"]
     cell.reset()
+
+
+@pytest.mark.parametrize(
+    ("module", "words", "status"),
+    [
+        ("sdev", ["-e", "mod0", "mod1"], 2),
+        ("sdev", ["-qe", "mod0"], 2),
+        ("sdev", ["mod0", "--emergency-stop"], 2),
+        ("front", ["stop", "mod0", "mod1"], 0),
+        ("front", ["stop", "mod0", "mod9", "mod1"], 1),
+    ],
+)
+def test_a_stop_on_a_command_line_that_is_wrong_elsewhere_stops(
+    daemon: Daemon, cell: sioms.Workcell, module: str, words: list[str], status: int
+) -> None:
+    program = f"import sys; from sioms.tools.{module} import main; sys.exit(main({words}))"
+    with cell.open("mod0.xaxis", "rw") as axis, cell.open("mod1", "rw") as other:
+        for each in (axis, other):
+            each.jog(0.05)
+        done = subprocess.run(
+            [sys.executable, "-c", program], env={**os.environ, "SIOMS_SOCKET": daemon.socket},
+            stderr=subprocess.PIPE, text=True, timeout=60, check=False,
+        )  # fmt: skip
+        assert done.returncode == status, done.stderr
+        assert ("the whole workcell has been stopped" in done.stderr) == bool(status)
+        for each in (axis, other):
+            assert each.read().status[0] & AxisStatus.EMERGENCY_STOP
+            at_rest(each, 2.0)
+    cell.reset()
+    for name in ("mod0", "mod1"):
+        cell.reset(name)
 
 
 def test_a_stop_that_nobody_takes_is_an_error(start_daemon: Callable[..., Daemon]) -> None:
