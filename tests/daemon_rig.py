@@ -307,6 +307,12 @@ def at_rest(node: Any, timeout_s: float = 5.0) -> float:
     return time.monotonic() - began
 
 
+WORKFLOW_S = 500.0
+"""Longest that a whole workflow of `sioms reconcile` on a cell may take [s]: alone on two cores one takes 30 to 65 s,
+beside four busy loops at a load of 16 that of a finger took 184.
+"""
+
+
 class Waiting:
     """A call in a thread, and how it ended.
 

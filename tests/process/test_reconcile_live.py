@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 from conftest import Running
-from daemon_rig import Daemon, at_rest, wait_for
+from daemon_rig import WORKFLOW_S, Daemon, at_rest, wait_for
 
 from sioms.reconcile import command as reconcile
 
@@ -116,7 +116,7 @@ def test_a_hidden_friction_is_named_and_the_twin_takes_the_model(daemon: Daemon,
     twin_file = daemon.folder / "twin.toml"
     options = ("--yes", "--first", "one_speed", "--lap", "2", "--install", str(twin_file))
     run = workflow(daemon, tmp_path, *options)
-    assert run.wait_exit(500.0) == NAMED, said(run)
+    assert run.wait_exit(WORKFLOW_S) == NAMED, said(run)
     found = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert found["effects"] == ["coulomb"]
     friction = found["parameters"]["coulomb"]["Fc"]
@@ -165,7 +165,7 @@ def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs
     head = HEAD.format(device="mod0", more=f'effects_file = "{hidden}"')
     daemon = start_daemon('[workcell]\nname = "test"\n' + head + ARM)
     run = workflow(daemon, tmp_path, "--yes", "--first", "one_speed", "--lap", "2", node="mod0.arm", model=ARM_MODEL)
-    assert run.wait_exit(500.0) == NAMED, said(run)
+    assert run.wait_exit(WORKFLOW_S) == NAMED, said(run)
     asked = next(line for line in run.lines if "not told apart" in line)
     assert "gravity" in asked
     assert "offset" in asked

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Running
-from daemon_rig import Daemon, at_rest, wait_for
+from daemon_rig import WORKFLOW_S, Daemon, at_rest, wait_for
 
 from sioms.reconcile import command as reconcile
 
@@ -114,7 +114,7 @@ def test_two_effects_that_look_alike_are_told_apart_by_the_other_load_and_the_tw
     """
     twin = daemon.folder / "twin.toml"
     run = workflow(daemon, tmp_path, "--yes", "--first", "one", "--install", str(twin))
-    assert run.wait_exit(500.0) == NAMED, said(run)
+    assert run.wait_exit(WORKFLOW_S) == NAMED, said(run)
     asked = next(line for line in run.lines if "not told apart" in line)
     assert "gain" in asked
     assert "cross_talk" in asked

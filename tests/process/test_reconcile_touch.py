@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Running
-from daemon_rig import at_rest, wait_for
+from daemon_rig import WORKFLOW_S, at_rest, wait_for
 
 import sioms
 from sioms.drivers.framed_adc.simulated.finger import shape_of
@@ -96,7 +96,7 @@ def test_hidden_gains_are_named_and_the_driver_loads_the_finger(cell: Path, tmp_
     """Light touches: the finger's own error, 0.3 % of its peak, stays below the noise, which moves a gain by 0.005."""
     file = cell / "finger.toml"
     run = workflow(cell, tmp_path, "--yes", "--load", "80", "--most-load", str(MOST), "--install", str(file))
-    assert run.wait_exit(500.0) == NAMED, said(run)
+    assert run.wait_exit(WORKFLOW_S) == NAMED, said(run)
     found = json.loads((tmp_path / "report" / "verdict.json").read_text())
     assert found["effects"] == ["gain_scatter"]
     true = scattered(shape_of(PUBLIC, HIDDEN)).gains / 3.0 - 1.0
