@@ -106,6 +106,11 @@ class Requests:
         if session.greeting is not None:
             session.greeting.cancel()
             session.greeting = None
+        if isinstance(message, verbs.Said):
+            if not session.peer.key:
+                raise MalformedMessage("how old a word is, is a gateway's to say")
+            session.said_ns = message.at_ns
+            return
         if not message.query:
             self._clients.changes += 1
         if starting := self._starting():

@@ -99,6 +99,7 @@ class Session:
         greeting: ends it if it says nothing; None once it has.
         greeted: whether it has said hello.
         leash: of the journals that it reads; None: of none.
+        said_ns: when the reset that follows was sent at the earliest [ns, CLOCK_MONOTONIC]; 0: it has not been said.
     """
 
     sock: socket.socket
@@ -110,6 +111,7 @@ class Session:
     greeting: Timer | None = None
     greeted: bool = False
     leash: Leash | None = None
+    said_ns: int = 0
 
     @property
     def user(self) -> str:

@@ -66,6 +66,7 @@ class StopVerbs:
     def reset(self, session: Session, message: Reset) -> None:
         """Reset the workcell, or a node, or the fault of its device."""
         (name,) = message
+        sent_ns, session.said_ns = session.said_ns, 0
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
@@ -73,6 +74,9 @@ class StopVerbs:
                 raise Refused(errno.EPERM, "reset: the workcell has no supervisor; start `sioms supervise`")
             if source := self._stops.hear_request():
                 raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
+            if sent_ns and self._stops.stopped_since(sent_ns):
+                source = self._cell.shared.latch.source
+                raise Refused(errno.EAGAIN, f"reset: stopped ({source}) after this was sent; see why, and reset again")
             self._stops.reset_workcell(str(session))
             return
         node = self._nodes.find(session, "reset", name, message.right)
@@ -84,6 +88,8 @@ class StopVerbs:
         latch = self._cell.shared.latch
         if latch.stopped_ns:
             raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
+        if sent_ns and self._stops.stopped_since(sent_ns, node):
+            raise Refused(errno.EAGAIN, f"reset {name}: stopped after this was sent; see why, and reset again")
         try:
             self._stops.reset_node(node, str(session))
         except OSError as error:

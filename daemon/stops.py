@@ -30,6 +30,10 @@ class Stops:
         self._cell = cell
         self._shared = cell.shared
         self._request_seen = self._shared.request.mark
+        self._stopped_ns = 0
+        """When somebody last asked for the stop of the workcell, stopped already or not."""
+        self._nodes_stopped_ns: dict[tuple[str, int, int], int] = {}
+        """The same of channels of nodes: device, block, channel."""
 
     def restore(self) -> None:
         """Be stopped from the beginning when it was so at the end."""
@@ -46,6 +50,7 @@ class Stops:
     def stop_workcell(self, source: str) -> None:
         """Latch the emergency stop, wake every driver, and keep it."""
         latch = self._shared.latch
+        self._stopped_ns = time.monotonic_ns()
         known = not latch.stop(time.monotonic_ns(), source) and not (
             latch.source == self._shared.request.source != source
         )
@@ -105,11 +110,24 @@ class Stops:
         Raises:
             OSError: EIO, its driver takes no messages: it will be stopped when it is started again.
         """
+        now_ns = time.monotonic_ns()
+        self._nodes_stopped_ns |= dict.fromkeys(_channels(node), now_ns)
         try:
             self._order(node, driver_verbs.NodeStop(*_parts(node), source, self._shared.latch.resets))
         finally:
             self._note(self._node_entry(node, source, stop=True))
             self._cell.log("warning", "emergency stop", node=node.name, source=source)
+
+    def stopped_since(self, instant_ns: int, node: Node | None = None) -> bool:
+        """Return whether a stop of the workcell, or of a node, has been asked for since an instant.
+
+        Args:
+            instant_ns: [ns, CLOCK_MONOTONIC].
+            node: which; None: the workcell.
+        """
+        if node is None:
+            return max(self._stopped_ns, self._shared.latch.stopped_ns) > instant_ns
+        return any(self._nodes_stopped_ns.get(channel, 0) > instant_ns for channel in _channels(node))
 
     def reset_node(self, node: Node, who: str) -> None:
         """Clear the stop and the faults of a node.
@@ -214,3 +232,8 @@ class Stops:
 def _parts(node: Node) -> tuple[int, list[int], int]:
     """Return the block, the channels and the bit that a node shows."""
     return node.block, list(node.channels), node.bit
+
+
+def _channels(node: Node) -> list[tuple[str, int, int]]:
+    """Return the device, the block and each channel that a node shows."""
+    return [(node.device, node.block, channel) for channel in node.channels]

@@ -23,7 +23,7 @@ from sioms.protocol.page import as_of_ns
 from .parts import Followed, Held, Outside, Principal, Session
 
 KEEPALIVE = verbs.Keepalive().packed()
-READ = (verbs.Represent, verbs.Supervise, verbs.Journal, verbs.Cancel, verbs.Open)
+READ = (verbs.Represent, verbs.Said, verbs.Supervise, verbs.Reset, verbs.Journal, verbs.Cancel, verbs.Open)
 """Requests to the daemon of which the gateway reads more than that they are not these."""
 PASSED_ON = frozenset(map(int, ClientVerb)) - {int(each.verb) for each in READ}
 SHORT_NUMBERS = frozenset((*range(0x80), 0xCC, 0xCD, 0xCE))
@@ -130,7 +130,7 @@ class Gateway:
                 return  # had before: nothing is taken twice
             if number != session.heard + 1:
                 raise MalformedFrame(f"frame {number} after {session.heard}: what was in between is lost")
-            if stamp_ns > session.sent_ns:
+            if stamp_ns > now_ns:  # it is told times by the answers to its stops, too, which come another way
                 raise MalformedFrame("a frame that repeats a time that it has not been told")
             session.heard, session.heard_ns = number, now_ns
             self._take(session, kind, channel, stamp_ns, body, now_ns)
@@ -172,7 +172,7 @@ class Gateway:
             case Up.PACKET if channel:
                 self._to_driver(session, channel, stamp_ns, body, now_ns)
             case Up.PACKET:
-                self._to_daemon(session, body, now_ns - stamp_ns)
+                self._to_daemon(session, body, stamp_ns)
             case Up.CREDIT if channel & link.JOURNAL:
                 for followed in session.followed.values():
                     if followed.channel == channel:
@@ -214,17 +214,17 @@ class Gateway:
         except OSError:
             self.driver_gone(session, handle)
 
-    def _to_daemon(self, session: Session, packet: bytes, age_ns: int) -> None:
+    def _to_daemon(self, session: Session, packet: bytes, stamp_ns: int) -> None:
         if session.taken_in and _is_passed_on(packet):
             self._to_line(session, packet)
             return
         number, message = verbs.take(packet, verbs.FROM_CLIENT)
-        if number >= OWN_NUMBERS or isinstance(message, verbs.Represent):
+        if number >= OWN_NUMBERS or isinstance(message, verbs.Represent | verbs.Said):
             raise MalformedMessage("that is the gateway's to say")
         if session.taken_in:
-            self._pass(session, number, message, packet, age_ns)
+            self._pass(session, number, message, packet, stamp_ns)
             return
-        session.waiting.append(packet)
+        session.waiting.append((packet, stamp_ns))
         if len(session.waiting) > MOST_WAITING:
             raise MalformedMessage(f"{MOST_WAITING} packets before the first answer")
         if session.line is None:
@@ -235,14 +235,16 @@ class Gateway:
             except OSError as error:
                 self._refuse_waiting(session, error.errno or errno.EIO, error.strerror or str(error))
 
-    def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes, age_ns: int = 0) -> None:
+    def _pass(self, session: Session, number: int, message: verbs.Message, packet: bytes, stamp_ns: int) -> None:
         if isinstance(message, verbs.Supervise):  # from when its client was last told the time, as any lease
-            left_s = message.lease_s - age_ns / 1e9
+            left_s = message.lease_s - (self._now() - stamp_ns) / 1e9
             if left_s <= 0:
                 text = f"supervise: the link is late by more than the lease of {message.lease_s:g} s"
                 self._send(session, Down.PACKET, body=refusal(number, errno.ETIMEDOUT, text))
                 return
             packet = verbs.Supervise(left_s).packed(number)
+        if isinstance(message, verbs.Reset):
+            self._to_line(session, verbs.Said(stamp_ns).packed())
         if isinstance(message, verbs.Journal):
             session.asks[number] = message.device
         if isinstance(message, verbs.Cancel) and self._cancelled(session, number, message.number):
@@ -283,7 +285,7 @@ class Gateway:
             session.line.close()
             session.line = None
         waiting, session.waiting = session.waiting, []
-        for packet in waiting:
+        for packet, _ in waiting:
             number, _ = verbs.take(packet, verbs.FROM_CLIENT)
             self._send(session, Down.PACKET, body=refusal(number, errno_, text))
 
@@ -355,8 +357,8 @@ class Gateway:
             return
         session.taken_in = True
         waiting, session.waiting = session.waiting, []
-        for packet in waiting:
-            self._pass(session, *verbs.take(packet, verbs.FROM_CLIENT), packet)
+        for packet, stamp_ns in waiting:
+            self._pass(session, *verbs.take(packet, verbs.FROM_CLIENT), packet, stamp_ns)
 
     def _informed(self, session: Session, own: int, message: Sequence[object]) -> None:
         """Send an open on, now that it is known whether the node can be written."""

@@ -163,7 +163,7 @@ class Session:
         urgent_ns: until when snapshots that are owed are sent as they come.
         line: to the daemon; None before the first packet.
         taken_in: whether the daemon has taken it for the key's.
-        waiting: packets from before that.
+        waiting: packets from before that, and the times that they repeat [ns].
         opens: what waits for an answer: leases by message number of the open.
         asked: opens that wait for what their node is, by number of the gateway's own request.
         held: open nodes by handle.
@@ -181,7 +181,7 @@ class Session:
     urgent_ns: int = 0
     line: Line | None = None
     taken_in: bool = False
-    waiting: list[bytes] = field(default_factory=list)
+    waiting: list[tuple[bytes, int]] = field(default_factory=list)
     opens: dict[int, tuple[str, float]] = field(default_factory=dict)
     asked: dict[int, tuple[int, verbs.Open]] = field(default_factory=dict)
     held: dict[int, Held] = field(default_factory=dict)

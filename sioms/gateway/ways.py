@@ -128,7 +128,8 @@ class Ways:
         number, message = verbs.take(packet, verbs.FROM_CLIENT)
         if kind != Up.PACKET or not isinstance(message, verbs.EmergencyStop):
             return None
-        return link.pack(Down.PACKET, body=self._stop(who, host, number, message, begun))
+        answer = self._stop(who, host, number, message, begun)
+        return link.pack(Down.PACKET, stamp_ns=time.monotonic_ns(), body=answer)
 
     def _stop(
         self, who: Principal, host: str, number: int, message: verbs.EmergencyStop, begun: Begun | None = None

@@ -90,6 +90,7 @@ class ClientVerb(IntEnum):
     ACKNOWLEDGE = 24
     SUPERVISE = 25
     TELL_ALARM = 26
+    SAID = 27
     CANCEL = 30
 
 

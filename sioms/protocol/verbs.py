@@ -331,6 +331,14 @@ class Reset(
     node: Name
 
 
+class Said(Message, on=FROM_CLIENT, verb=ClientVerb.SAID, notice=True, query=True):
+    """The reset that follows was sent at this instant at the earliest [ns, CLOCK_MONOTONIC]: what was stopped since
+    then stays stopped. A gateway says so, and nobody else: what it passes on may be old.
+    """
+
+    at_ns: Integer
+
+
 class Reload(Message, on=FROM_CLIENT, verb=ClientVerb.RELOAD, right=Right.ADMINISTER):
     """Reload the configuration. Answer: all errors; if there are any, nothing has changed."""
 

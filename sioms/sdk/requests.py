@@ -67,6 +67,8 @@ def ioctl(
         case Request.RESET:
             if argument is not None and (type(argument) is not int or argument < 0):
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as instant; want a time in ns, or none for now")
+            if argument is None and handle.passed_on:  # of a client that was told the time last then, by a gateway
+                argument = handle.heard_ns
             return service.stops.reset_by(handle, what, argument, service.loop.heed)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}

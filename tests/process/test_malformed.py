@@ -513,3 +513,10 @@ def test_no_field_of_a_record_takes_what_is_not_finite(cell: sioms.Workcell, bit
                 axis.command(0, **{name: value}, **others)
         reading = axis.read()
         assert reading.buffered[0] == 0 and not reading.in_motion[0]
+
+
+def test_who_is_no_gateway_does_not_say_how_old_its_words_are(raw: Callable[[], Raw]) -> None:
+    session = raw()
+    assert session.ask(ClientVerb.LIST, 1)[0][2] == 0
+    session.sock.send(encode(ClientVerb.SAID, 0, 7))
+    assert session.is_ended()

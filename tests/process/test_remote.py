@@ -26,6 +26,7 @@ from sioms.client.command import command
 from sioms.client.keys import Folder
 from sioms.gateway.connections import MOST_STRANGERS
 from sioms.gateway.inflow import MOST
+from sioms.protocol.flags import AxisStatus
 from sioms.protocol.link import DEFAULT_LEASE_S
 
 
@@ -182,9 +183,36 @@ def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
         relay.treat()
         assert writing.errno() == errno.ECANCELED
         for _ in range(20):
-            cell.emergency_stop(node)
+            far.emergency_stop(node)
             far.reset(node)
             axis.command(velocity=0.01)  # who knows of the reset is not refused
+
+
+@pytest.mark.parametrize("way", ["of the cell", "of the node", "of the workcell"])
+def test_a_reset_that_was_under_way_leaves_a_later_stop(
+    daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str
+) -> None:
+    with (
+        Relay(gate.port) as relay,
+        sioms.Workcell(gate.trusted(relay.port), "far") as far,
+        far.open("mod1", "rw", lease=10.0) as axis,
+        cell.open("mod1.readonly") as seen,
+    ):
+        reset = {
+            "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "of the workcell": lambda: far.reset()
+        }[way]  # fmt: skip
+        name = "" if way == "of the workcell" else "mod1"
+        cell.emergency_stop(name)
+        wait_for(lambda: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "the client to see the first stop")
+        relay.treat(stalled=True)
+        resetting = Waiting(reset)
+        time.sleep(0.1)
+        cell.emergency_stop(name)
+        relay.treat()
+        assert resetting.errno() == errno.EAGAIN
+        assert seen.read().status[0] & AxisStatus.EMERGENCY_STOP
+        reset()
+        wait_for(lambda: not seen.read().status[0] & AxisStatus.EMERGENCY_STOP, "reset")
 
 
 def test_a_revoked_key_is_out_at_once(daemon: Daemon, gate: Gateway, cell: sioms.Workcell) -> None:

@@ -81,7 +81,7 @@ def test_what_the_gateway_reads_it_reads_however_it_is_packed(world: World, how:
     assert [tuple(verbs.take(each, verbs.FROM_CLIENT)[1]) for each in line.got[got:]] == [(1.5,)]
     samples = {
         verbs.Represent: ("root", "here", []), verbs.Supervise: (1.0,), verbs.Journal: ("mod0",), verbs.Cancel: (7,),
-        verbs.Open: ("mod0", 3, 0.0, 0.0), verbs.List: (),
+        verbs.Open: ("mod0", 3, 0.0, 0.0), verbs.List: (), verbs.Said: (7,), verbs.Reset: ("mod0",),
     }  # fmt: skip
     assert samples.keys() == {*READ, verbs.List}
     for name, fields in samples.items():  # none of them with a number that is the gateway's
