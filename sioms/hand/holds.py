@@ -1,8 +1,9 @@
 """Find the holds in what a hand's devices told all along: rows of grasps, as a survey records them.
 
-A hold is a time in which both fingers are touched, no joint moves and no load changes. Each tells one row, the mean of
-its last second: a damper's swings are averaged, and two rows of one hold would count what is one reading twice. A
-grasp is what lies between two losses of contact. How the object was moved between holds does not matter
+A hold is a time in which both fingers are touched and, on the average of a second, no joint moves and no load changes:
+while the hand stands, loads swing against each other once a second by up to a fifth, for the object sticks to the
+platen. Each hold tells one row, the mean of a second near its end: two rows of one hold would count what is one reading
+twice. A grasp is what lies between two losses of contact. How the object was moved between holds does not matter
 (docs/reconcile-hand.md, What is compared).
 
 Pure: arrays in, rows out.
@@ -20,15 +21,14 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 BLOCK_S = 0.25
-"""What is told is averaged over blocks of this length in the hand's time [s], which are judged by their means."""
-MEANT = 4  # blocks that a row is the mean of
-BEFORE, AFTER = 2, 1  # steady blocks that go before these, while what moved settles, and after them
-STILL = (5e-5, 5e-5, 5e-3)
-"""By how much x, y [m] and th [rad] of a module may go on from block to block: drives that move bear by their
+"""What is told is averaged over blocks of this length in the hand's time [s]."""
+MEANT = 4  # blocks that a mean is of, by which a hold is judged, and its row
+STEADY = 4  # means, each a block later than the one before, that must agree: a hold of 1.75 s
+STILL = (1e-4, 1e-4, 8e-3)
+"""By how much the means of x, y [m] and th [rad] of a module may go on in a block: drives that move bear by their
 damping what their stiffness does not."""
-EVEN, EVEN_N = 0.08, 0.03
-"""By which share, or by how many newtons, a load may change from block to block: in a hold it swings by some per
-cent."""
+EVEN, EVEN_N = 0.06, 0.03
+"""By which share, or by how many newtons, the mean of a load may change in a block."""
 JOINTS, COMMANDS, PLACES, LOADS, WRISTS = slice(0, 6), slice(10, 16), slice(6, 8), slice(8, 10), slice(16, 20)
 TOLD = 20  # joints, places, loads, commands and wrists, as `sioms.hand.survey.Told` has them
 
@@ -56,10 +56,10 @@ def holds(streams: Sequence[Stream]) -> list[list[float]]:
     Args:
         streams: of both modules and both fingers, and of wrists where there are any.
     """
-    first, last = (f(s.time_s[i] for s in streams if len(s.time_s)) for f, i in ((max, 0), (min, -1)))
-    if not all(len(s.time_s) for s in streams) or last <= first:
+    if not all(len(stream.time_s) for stream in streams):
         return []
-    count = int((last - first) / BLOCK_S)
+    first = max(float(stream.time_s[0]) for stream in streams)
+    count = max(0, int((min(float(stream.time_s[-1]) for stream in streams) - first) / BLOCK_S))
     told = np.full((count, TOLD), math.nan)
     touched: NDArray[np.bool_] = np.ones(count, dtype=np.bool_)
     for stream in streams:
@@ -70,10 +70,19 @@ def holds(streams: Sequence[Stream]) -> list[list[float]]:
             lost = np.bincount(block[inside], ~stream.touched[inside], count) > 0
             touched[lost] = False
     grasp = np.cumsum(np.diff(touched, prepend=False) & touched) - 1
+    mean = _moving(told)
+    good = _moving(touched[:, None].astype(np.float64))[:, 0] == 1.0
     return [
-        [first + BLOCK_S * end, float(grasp[end - 1]), *np.mean(told[end - MEANT : end], axis=0).tolist()]
-        for end in _ends(touched & _steady(told))
+        [first + BLOCK_S * (end + 1), float(grasp[end]), *mean[end].tolist()] for end in _ends(good & _steady(mean))
     ]
+
+
+def _moving(told: Floats) -> Floats:
+    """Return the mean of each block and those before it, nan where there are too few, shape (blocks, k)."""
+    if len(told) < MEANT:
+        return np.full(told.shape, math.nan)
+    windows = np.lib.stride_tricks.sliding_window_view(told, MEANT, axis=0).mean(axis=-1)
+    return np.concatenate([np.full((MEANT - 1, told.shape[1]), math.nan), windows])
 
 
 def _means(block: NDArray[np.int64], values: Floats, count: int) -> Floats:
@@ -89,19 +98,18 @@ def _means(block: NDArray[np.int64], values: Floats, count: int) -> Floats:
     return out
 
 
-def _steady(told: Floats) -> NDArray[np.bool_]:
-    """Say of which blocks joints and loads are as in the block before, shape (blocks,)."""
-    moved = np.abs(np.diff(told[:, JOINTS], axis=0, prepend=math.nan))
-    load = told[:, LOADS]
-    changed = np.abs(np.diff(load, axis=0, prepend=math.nan))
-    even = (changed < np.maximum(EVEN * np.abs(load), EVEN_N)).all(axis=1)
-    placed = np.isfinite(told[:, PLACES]).all(axis=1)
-    return np.asarray((moved < np.tile(STILL, 2)).all(axis=1) & even & placed, dtype=np.bool_)
+def _steady(mean: Floats) -> NDArray[np.bool_]:
+    """Say which means are as those of a block before, shape (blocks,)."""
+    changed = np.abs(np.diff(mean, axis=0, prepend=math.nan))
+    load = np.abs(mean[:, LOADS])
+    even = (changed[:, LOADS] < np.maximum(EVEN * load, EVEN_N)).all(axis=1)
+    placed = np.isfinite(mean[:, PLACES]).all(axis=1)
+    return np.asarray((changed[:, JOINTS] < np.tile(STILL, 2)).all(axis=1) & even & placed, dtype=np.bool_)
 
 
 def _ends(good: NDArray[np.bool_]) -> Iterator[int]:
-    """Yield where the rows of long enough runs of good blocks end."""
+    """Yield the last but one of each long enough run of good means: the last one may have begun to move."""
     edges = np.flatnonzero(np.diff(good.astype(np.int64), prepend=0, append=0))
     for start, end in edges.reshape(-1, 2):
-        if end - start >= BEFORE + MEANT + AFTER:
-            yield int(end) - AFTER
+        if end - start >= STEADY - 1:
+            yield int(end) - 2

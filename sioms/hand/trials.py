@@ -10,7 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull
 
+from sioms.hand.contacts import LEAST_FRICTION
 from sioms.hand.plane import PlaneHand, Rig
 from sioms.hand.skills import Skills
 from sioms.hand.touch import Failed, Fault, Manner, State
@@ -18,6 +20,10 @@ from sioms.plant.outline import Outline, disk, ellipse, polygon, rectangle, spli
 from sioms.plant.planar import Body, Mount
 
 SHAPES = ("disk", "ellipse", "rectangle", "polygon", "spline")
+FAMILIES = (*SHAPES, "hull")
+"""Polygons have their corners on an ellipse; a hull is that of random points, a third of them with sharp corners."""
+SURE = LEAST_FRICTION
+"""Coefficient from which on nothing may be dropped."""
 WITHIN_RAD = math.radians(1.0)
 _MOST_TRIES = 200
 
@@ -73,10 +79,14 @@ class Outcome:
     time_s: float
 
 
-def draw(number: int, seed: int = 1) -> Subject:
-    """Draw object `number`: width 20 to 80 mm, friction 0.8 to 3.4, any angle, up to 10 mm beside the hand's middle."""
+def draw(number: int, seed: int = 1, shapes: Sequence[str] = SHAPES) -> Subject:
+    """Draw object `number`: width 20 to 80 mm, friction 0.8 to 3.4, any angle, up to 10 mm beside the hand's middle.
+
+    Args:
+        shapes: families, of which the objects are in turn.
+    """
     random = np.random.default_rng([seed, number])
-    shape = SHAPES[number % len(SHAPES)]
+    shape = shapes[number % len(shapes)]
     size = float(random.uniform(0.02, 0.07))
     outline = _outline(shape, size, random)
     least = min(outline.width(math.radians(a)) for a in range(0, 180, 5))
@@ -101,6 +111,11 @@ def _outline(shape: str, size: float, random: np.random.Generator) -> Outline:
     if shape == "rectangle":
         return rectangle(long, size, float(random.uniform(0.5e-3, 3e-3)))
     for _ in range(_MOST_TRIES):
+        if shape == "hull":
+            found = _hull(0.5 * long, 0.5 * size, random)
+            if _is_graspable(found):
+                return found
+            continue
         count = int(random.integers(3, 9)) if shape == "polygon" else int(random.integers(5, 9))
         turns = np.sort(random.uniform(0.0, math.tau, count)) if shape == "polygon" else (
             math.tau * (np.arange(count) + random.uniform(-0.15, 0.15, count)) / count
@@ -111,10 +126,25 @@ def _outline(shape: str, size: float, random: np.random.Generator) -> Outline:
             found = polygon(points, float(random.uniform(0.5e-3, 3e-3))) if shape == "polygon" else spline(points)
         except ValueError:
             continue
-        widths = [found.width(math.radians(a)) for a in range(0, 180, 5)]
-        if min(widths) > 0.015 and max(widths) < 0.1:
+        if _is_graspable(found):
             return found
     return ellipse(0.5 * long, 0.5 * size)
+
+
+def _is_graspable(outline: Outline) -> bool:
+    widths = [outline.width(math.radians(a)) for a in range(0, 180, 5)]
+    return min(widths) > 0.015 and max(widths) < 0.1
+
+
+def _hull(half_x_m: float, half_y_m: float, random: np.random.Generator) -> Outline:
+    """Return the convex hull of random points in a rectangle, its corners sharp or rounded as far as they allow."""
+    points = random.uniform(-1.0, 1.0, (int(random.integers(3, 13)), 2)) * [half_x_m, half_y_m]
+    corners = points[ConvexHull(points).vertices]
+    sharp, corner_m = random.random() < 1.0 / 3.0, float(random.uniform(0.2e-3, 3e-3))
+    try:
+        return polygon(corners, 0.0 if sharp else corner_m)
+    except ValueError:  # a side is too short for that
+        return polygon(corners)
 
 
 def carry_out(subject: Subject, hold_s: float = 2.0, rig: Rig = Rig(), manner: Manner = Manner()) -> Outcome:  # noqa: B008
@@ -163,3 +193,30 @@ def share(outcomes: Sequence[Outcome], shape: str = "") -> float:
     """Return the share of outcomes (of a shape) with a friction angle of at most 1 degree by the counted steps."""
     these = [one for one in outcomes if not shape or one.shape == shape]
     return sum(one.counted_rad <= WITHIN_RAD for one in these) / max(len(these), 1)
+
+
+@dataclass(frozen=True, slots=True)
+class Losses:
+    """How often objects were lost; immutable.
+
+    Args:
+        sure, of_sure: objects that were lost, and all, with a coefficient of `SURE` and more.
+        slippery, of_slippery: the same below it.
+        silent: of those below it that were lost, how many without a word before.
+    """
+
+    sure: int
+    of_sure: int
+    slippery: int
+    of_slippery: int
+    silent: int
+
+
+def losses(outcomes: Sequence[Outcome]) -> Losses:
+    """Count the objects that were lost."""
+    sure = [one for one in outcomes if one.friction >= SURE]
+    slippery = [one for one in outcomes if one.friction < SURE]
+    return Losses(
+        sum(one.dropped for one in sure), len(sure), sum(one.dropped for one in slippery), len(slippery),
+        sum(one.dropped and not one.warned for one in slippery),
+    )  # fmt: skip

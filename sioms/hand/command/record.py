@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     except (Failed, OSError, KeyboardInterrupt) as failed:
         if not (surveys and surveys[0].rows) and not isinstance(failed, Failed):
             raise
-        print(f"sioms hand record: broken off: {failed or 'interrupted'}", file=sys.stderr)
+        print(f"sioms hand record: broken off: {str(failed) or 'interrupted'}", file=sys.stderr)
     rows = surveys[0].rows if surveys else []
     for event in surveys[0].events if surveys else []:
         print(f"{event.time_s:8.2f} s  {event.text}", file=sys.stderr)

@@ -7,16 +7,23 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from sioms.hand.command import VERBS, add_parser, run
 from sioms.hand.command.canvas import HEIGHT, VIEW_M, WIDTH, drawn
 from sioms.hand.command.frames import Frame, Side
 from sioms.hand.command.skill import carry_out, lines
-from sioms.hand.plane import PlaneHand
+from sioms.hand.kinematics import Hand
+from sioms.hand.plane import PlaneHand, Rig
+from sioms.hand.regrasp import NEUTRAL
 from sioms.hand.touch import Event, Failed, Fault, Manner
+from sioms.hand.trials import Losses, Outcome, draw, losses
 from sioms.plant.outline import ellipse
-from sioms.plant.planar import Body
+from sioms.plant.planar import Body, Mount, World
+
+_JOINTS = Hand().inverse((0.0, 0.0, 0.0, Rig().open_m, NEUTRAL, NEUTRAL))
+OPEN = _JOINTS[:3], _JOINTS[3:]
 
 
 def _words(*words: str) -> argparse.Namespace:
@@ -37,6 +44,34 @@ def test_trials_count_what_becomes_of_objects(capsys: pytest.CaptureFixture[str]
     assert run(_words("trials", "--count", "1")) == 0
     out = capsys.readouterr().out
     assert "disk" in out and "held" in out and "all       100.0 %" in out
+    assert "lost: 0 of 1 with a coefficient of 1.4 and more; 0 of 0 below it, 0 of them without a warning before" in out
+
+
+def test_an_unknown_family_of_objects_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(_words("trials", "--shapes", "disk", "cubes")) == 2
+    assert "no family cubes; want disk, ellipse" in capsys.readouterr().err
+
+
+def test_losses_are_counted_apart_by_friction_and_warning() -> None:
+    lost = [
+        Outcome(0, "disk", friction, 0.0, 0.0, 0.0, 0, 0, not dropped, None, dropped, warned, 1.0)
+        for friction, dropped, warned in (
+            (1.4, False, True), (2.0, True, False), (1.3, True, True), (0.9, True, False), (0.8, False, True),
+        )
+    ]  # fmt: skip
+    assert losses(lost) == Losses(1, 2, 2, 3, 1)
+
+
+def test_hulls_are_general_convex_polygons_sharp_and_rounded() -> None:
+    """No two sides alike, corners on no common ellipse, and none in which a finger would be at the start."""
+    drawn = [draw(number, 7, ("hull",)) for number in range(40)]
+    sharp = [one.outline.points for one in drawn if len(one.outline.points) < 13]
+    assert 8 < len(sharp) < 32 and {len(points) for points in sharp} >= {4, 5, 6}
+    for points in sharp:
+        sides = np.linalg.norm(np.roll(points, -1, axis=0) - points, axis=1)
+        assert np.min(np.diff(np.sort(sides))) > 0.0
+        assert float(np.ptp(np.linalg.norm(points, axis=1))) > 1e-3
+    assert all(min(World(Body(one.outline), [Mount()] * 2, OPEN, one.pose).clearances()) > 0.02 for one in drawn)
 
 
 def test_no_trials_are_refused(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from recording_rig import START_NS, write_slots
 
 from sioms.hand.command import record
+from sioms.hand.holds import Stream, holds
 from sioms.hand.survey import COLUMNS, rows_of
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
@@ -145,3 +146,28 @@ def test_a_recording_without_grasps_is_refused_in_a_sentence(
     with pytest.raises((ValueError, OSError), match=said):
         taken(tmp_path, *words)
     assert not (tmp_path / "day.csv").exists()
+
+
+def test_loads_that_swing_against_each_other_once_a_second_are_a_hold_and_those_that_go_on_are_none() -> None:
+    """The object sticks to the platen; on the average of a second nothing moves. A grasp that turns is no hold."""
+    time_s = np.arange(0.0, 6.0, 0.01)
+    swing = 0.2 * np.sin(2.0 * math.pi * time_s / 1.1)
+
+    def told(turning: float) -> list[Stream]:
+        module = np.zeros((len(time_s), 12))
+        module[:, 2] = 1.5 + 5e-3 * swing + turning * time_s
+        loads = [1.0 + swing, 1.0 - swing]
+        fingers = [np.stack([1.4 + 0.2 * swing, load], axis=1) for load in loads]
+        yes = np.ones(len(time_s), dtype=np.bool_)
+        return [
+            Stream(time_s, module[:, :6], (0, 1, 2, 10, 11, 12)), Stream(time_s, module[:, 6:], (3, 4, 5, 13, 14, 15)),
+            *(Stream(time_s, finger, (6 + i, 8 + i), yes) for i, finger in enumerate(fingers)),
+        ]  # fmt: skip
+
+    (row,) = holds(told(0.0))
+    assert row[10:12] == pytest.approx([1.0, 1.0], abs=0.03) and row[8] == pytest.approx(1.4, abs=6e-3)
+    assert holds(told(0.1)) == []
+    for count in (0, 1, 150):  # too short
+        cut = [s.touched if s.touched is None else s.touched[:count] for s in told(0.0)]
+        pairs = zip(told(0.0), cut, strict=True)
+        assert holds([Stream(s.time_s[:count], s.values[:count], s.columns, yes) for s, yes in pairs]) == []
