@@ -35,6 +35,7 @@ from sioms.reconcile.sensors.verdict import SensorVerdict
 JOINTS = tuple(f"{joint}{finger}" for finger in (1, 2) for joint in ("x", "y", "th"))
 COMMANDS = tuple(f"cmd_{joint}" for joint in JOINTS)
 PLACES, LOADS = ("place1", "place2"), ("load1", "load2")
+RECORDED = ".mcap"
 GRASPS_N = (0.2, 4.0)
 WRISTS = ("fx1", "fy1", "fx2", "fy2")
 NEEDED = ("time", "grasp", "kind", "thing", "size", *JOINTS, *PLACES, *LOADS)
@@ -73,7 +74,7 @@ def read_model(path: Path) -> tuple[SensorModel, Noise]:
 
 
 def read_grasps(data: Path) -> Grasps:
-    """Read all recordings.
+    """Read all recorded grasps; recordings of workcells beside them are left out.
 
     Raises:
         BadInputError: something is missing or not understood.
@@ -81,8 +82,15 @@ def read_grasps(data: Path) -> Grasps:
     if not data.exists():
         raise BadInputError(f"read {data}: no such file or folder")
     files = [data] if data.is_file() else sorted(p for p in data.iterdir() if p.suffix in SUFFIXES)
+    if not data.is_file() and any(p.suffix != RECORDED for p in files):  # recordings beside their grasps
+        files = [p for p in files if p.suffix != RECORDED]
     if not files:
         raise BadInputError(f"read {data}: no data files; expects one of {', '.join(SUFFIXES)}")
+    if files[0].suffix == RECORDED:
+        raise BadInputError(
+            f"read {files[0]}: a recording of a workcell does not say what was grasped; `sioms hand record -o FILE.csv "
+            f"--from {files[0]}` with --disk or --bar writes the grasps that it holds"
+        )
     parts = [grasps_of(load_columns(path), path.name, i) for i, path in enumerate(files)]
     later = np.cumsum([0, *(int(p.grasp.max(initial=0)) + 1 for p in parts)])
     columns = {name: np.concatenate([getattr(p, name) for p in parts]) for name in Grasps.__slots__}

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.hand.belief import settles
-from sioms.reconcile.hand.doubts import doubted
+from sioms.reconcile.hand.doubts import doubted, unsure
 from sioms.reconcile.hand.grasps import Floats, Grasps
 from sioms.reconcile.hand.model_file import Noise
 from sioms.reconcile.hand.plan import propose
@@ -37,6 +37,8 @@ TITLES = {
 SPANNED = 1e-2  # share of what is fitted that is no further number
 LEAST_FREE = 20  # rows of a view beyond what is fitted that tell its scatter
 TAILS = 1.5  # times the middle of what is left that its root mean square may be, and still be noise
+SLIGHT = 1.0  # times the stated noise of one row by which an effect must change at least one
+ROUNDS = 4  # searches without effects that are too small to be named
 LEAST, WORST = 0.5, 3.0  # times its stated noise that a view may scatter
 
 
@@ -53,6 +55,8 @@ class HandSubject:
     names: tuple[str, ...] = ()
     terms: tuple[str, ...] = ()
     settled: tuple[NamedEffect, ...] = ()
+    scatter: tuple[float, ...] = ()
+    """By how many times its stated noise each view is taken to scatter."""
 
     def views(self) -> Mapping[str, View]:
         """Gaps in their own units."""
@@ -197,7 +201,7 @@ def prepare(grasps: Grasps, model: SensorModel, noise: Noise | None = None) -> H
     d = d.with_sigma(d.sigma * scale[d.view])
     names = tuple(n for n, e in model.library.items() if e.rankable and not n.startswith(TERM_PREFIX))
     terms = tuple(n for n in model.library if n.startswith(TERM_PREFIX))
-    return HandSubject(*_parts(d), model, noise, tuple(notes), names, terms)
+    return HandSubject(*_parts(d), model, noise, tuple(notes), names, terms, (), tuple(scale.tolist()))
 
 
 def reconcile(
@@ -209,4 +213,30 @@ def reconcile(
         BadInputError: the records cannot be used.
     """
     subject = prepare(grasps, model, noise)
-    return doubted(analyse(subject, options), subject.whole, subject.propose)
+    verdict = analyse(subject, options)
+    for _ in range(ROUNDS):  # what is left of one may look like another
+        slight = slight_ones(subject, verdict)
+        if not slight:
+            break
+        library = {name: effect for name, effect in subject.model.library.items() if name not in slight}
+        subject = replace(
+            subject, model=replace(subject.model, library=library),
+            names=tuple(name for name in subject.names if name not in slight),
+            notes=(*subject.notes, *slight.values()),
+        )  # fmt: skip
+        verdict = analyse(subject, options)
+    return unsure(doubted(verdict, subject.whole, subject.propose), subject.whole, subject.propose)
+
+
+def slight_ones(subject: HandSubject, v: SensorVerdict) -> dict[str, str]:
+    """Return the named effects that change no row by as much as one reading of it is stated to scatter, and say so.
+
+    What all rows have alike, an estimator's bias or a sensor's own scale, is within that and looks like a small effect.
+    """
+    d, found = subject.whole, dict[str, str]()
+    for effect in v.effects:
+        change = np.abs(d.miss(d.predict(v.model)) - d.miss(d.predict(v.model.without_effect(effect.name))))
+        if float(np.max(change * np.array(subject.scatter)[d.view])) < SLIGHT:
+            told = ", ".join(f"{p.symbol} {p.value:.2g}" for p in effect.parameters)
+            found[effect.name] = f"{effect.title} ({told}) is within the stated noise of every row: not named"
+    return found
