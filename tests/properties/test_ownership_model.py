@@ -165,14 +165,13 @@ def test_a_stop_that_comes_between_taking_a_request_and_serving_it_holds() -> No
         cell = make()
         for action in [*begin("nobody owns anything"), ("open", 0, 0), ("hear", 0)]:
             cell.take(action)
-        take = Handle.take
+        hear = Handle.hear  # of a client, of whom something has come
 
-        def taken(of: Handle, most: int) -> tuple[bytes, bool]:
-            found = take(of, most)
+        def heard(of: Handle, now_ns: int) -> None:
+            hear(of, now_ns)
             assert cell.stop_node(1, 0) == "done"
-            return found
 
-        patch.setattr(Handle, "take", taken)
+        patch.setattr(Handle, "hear", heard)
         assert cell.move(0, 0) == "refused"
         patch.undo()
         assert _is_stopped(cell, 0)
