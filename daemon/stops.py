@@ -11,6 +11,7 @@ import time
 from typing import Any
 
 from sioms.protocol import driver_verbs
+from sioms.protocol.stopfile import SOMEBODY
 from sioms.protocol.stopjournal import NODE, PID, node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
@@ -52,7 +53,7 @@ class Stops:
         latch = self._shared.latch
         self._stopped_ns = time.monotonic_ns()
         known = not latch.stop(time.monotonic_ns(), source) and not (
-            latch.source == self._shared.request.source != source
+            source != latch.source and latch.source in (SOMEBODY, self._shared.request.source)
         )
         if not known:
             self._cell.log("warning", "emergency stop", source=source)

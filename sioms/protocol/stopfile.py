@@ -29,6 +29,10 @@ if TYPE_CHECKING:
 REQUEST, TAKEN = ".stop", ".stopped"
 _REQUEST = Struct("<QQ240s")
 _WORD = Struct("<Q")
+SOMEBODY = "somebody, through the stop-request page"
+"""The source of a request that cannot be told yet; whoever asked will tell the daemon, too."""
+_LOOKS = 20
+"""At a request that is just being written, whose time of change is there before its text."""
 
 
 class StopRequest:
@@ -44,19 +48,32 @@ class StopRequest:
     def __init__(self, fd: int, taken_fd: int) -> None:
         self._fd = fd
         self._taken_fd = taken_fd
+        self._mark: Mark = (0, 0)
+        self._word_before = 0
 
     @property
     def mark(self) -> Mark:
         """The present word and the time of the last change [ns, wall clock]; a change of either is a request."""
-        return int.from_bytes(os.pread(self._fd, 8, 0), "little"), os.fstat(self._fd).st_mtime_ns
+        mark = int.from_bytes(os.pread(self._fd, 8, 0), "little"), os.fstat(self._fd).st_mtime_ns
+        if mark != self._mark:
+            self._word_before, self._mark = self._mark[0], mark
+        return mark
 
     @property
     def source(self) -> str:
-        """Who requested last and why, as far as it said."""
-        data = os.pread(self._fd, _REQUEST.size, 0).ljust(_REQUEST.size, b"\0")
-        _, pid, why = _REQUEST.unpack(data)
-        text = printable(why.split(b"\0")[0].decode("utf-8", "replace"))
-        return f"pid {pid}{': ' + text if text else ''}, through the stop-request page"
+        """Who requested last and why, as far as it said.
+
+        The name of the one before is never told for it: where the word is still that of before the change that ``mark``
+        has seen, it is not known who wrote.
+        """
+        for _ in range(_LOOKS):
+            data = os.pread(self._fd, _REQUEST.size, 0).ljust(_REQUEST.size, b"\0")
+            word, pid, why = _REQUEST.unpack(data)
+            if word != self._word_before:
+                text = printable(why.split(b"\0")[0].decode("utf-8", "replace"))
+                return f"pid {pid}{': ' + text if text else ''}, through the stop-request page"
+            os.sched_yield()
+        return SOMEBODY
 
     @property
     def pid(self) -> int:

@@ -13,7 +13,7 @@ from sioms.daemon.cell import Cell
 from sioms.daemon.log import Log
 from sioms.daemon.stops import Stops
 from sioms.protocol.latch import LATCH_SIZE, Latch
-from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.stopfile import SOMEBODY, StopRequest
 
 PID = 4711
 
@@ -53,6 +53,15 @@ def test_a_request_of_the_sessions_process_is_its_stop(rig: Rig, heard_by_a_driv
     assert rig.latch.stopped_ns and rig.latch.source == "eva: enough" and rig.noted == ["eva: enough"]
     assert rig.request.taken(word) and not rig.stops.hear_request(), "it has been heard"
     assert rig.noted == ["eva: enough"]
+
+
+def test_a_stop_that_a_driver_could_not_name_yet_is_named_by_who_asked(rig: Rig) -> None:
+    rig.request.request(1000, PID, "enough")
+    rig.latch.stop(1001, SOMEBODY)
+    rig.stops.stop_for(PID, "eva: enough")
+    assert rig.latch.source == "eva: enough" and rig.noted == ["eva: enough"]
+    rig.stops.stop_for(PID + 1, "tom: me too")
+    assert rig.latch.source == "eva: enough", "and keeps that name"
 
 
 def test_a_request_of_another_process_is_another_stop(rig: Rig) -> None:

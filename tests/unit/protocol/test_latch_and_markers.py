@@ -16,7 +16,7 @@ from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import READ_SIZE, WRITE_STRUCT, numpy_dtype
 from sioms.protocol.socketpath import socket_path
-from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.stopfile import SOMEBODY, StopRequest
 
 
 def test_the_latch_holds_its_first_stop_until_reset() -> None:
@@ -80,6 +80,25 @@ def test_writing_the_old_word_takes_no_request_back(request_file: StopRequest, t
     assert request_file.mark[0] == before[0] and request_file.mark != before
     os.truncate(tmp_path / "stop", 0)
     assert request_file.mark != before and "pid 0" in request_file.source
+
+
+@pytest.mark.parametrize("requested", [False, True])
+def test_a_request_that_is_just_being_written_is_not_told_for_that_of_the_one_before(
+    request_file: StopRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, requested: bool
+) -> None:
+    """The time of a file's last change is there before what is written."""
+    if requested:
+        request_file.request(5, 42, "an old reason")
+    before = request_file.mark
+    os.utime(tmp_path / "stop", ns=(1, 1))
+    assert request_file.mark != before and request_file.source == SOMEBODY
+
+    def goes_on() -> None:
+        request_file.request(6, 43, "a new one")
+
+    monkeypatch.setattr(os, "sched_yield", goes_on)
+    assert request_file.source == "pid 43: a new one, through the stop-request page"
+    assert request_file.mark[0] == 6 and request_file.source == "pid 43: a new one, through the stop-request page"
 
 
 def test_a_request_is_taken(request_file: StopRequest) -> None:
