@@ -6,12 +6,16 @@ import os
 import threading
 import time
 from contextlib import suppress
+from typing import Self
 
 SHARE = 0.25
 """Of a processor, what threads that somebody else keeps busy may take in the real-time class."""
-_PROMPT = os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 ORDINARY_S = 1.0
 """How long they are ordinary ones when they have taken more [s]."""
+ORDINARY, PROMPT = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
+"""Classes of threads. Who is not privileged may leave the real-time class, and may not take back the flag."""
+MOMENT_NS = 50_000_000
+"""How long threads of a library that pass a stop on are prompt [ns]."""
 
 
 def be_prompt() -> bool:
@@ -23,8 +27,79 @@ def be_prompt() -> bool:
         Whether it does so from now on.
     """
     try:
-        os.sched_setscheduler(0, _PROMPT, os.sched_param(1))
+        os.sched_setscheduler(0, PROMPT, os.sched_param(1))
     except OSError:
+        return False
+    return True
+
+
+class Briefly:
+    """Has the thread that uses it in a ``with`` block be prompt there, unless it is in another class than the ordinary
+    one already. It must not fork there.
+
+    Concurrency: one thread; another one has its own.
+    """
+
+    _entered = False
+
+    def __enter__(self) -> Self:
+        with suppress(OSError):
+            if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
+                self._before = os.sched_getscheduler(0)
+                os.sched_setscheduler(0, os.SCHED_FIFO | self._before, os.sched_param(1))
+                self._entered = True
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._entered:
+            self._entered = False
+            with suppress(OSError):
+                os.sched_setscheduler(0, self._before, os.sched_param(0))
+
+
+class Hurry:
+    """Threads of a library that are prompt for a moment, while they pass a stop on.
+
+    Concurrency: any threads.
+    """
+
+    def __init__(self) -> None:
+        self._threads: dict[int, bool] = {}
+        self._until_ns = 0
+        self._lock = threading.Lock()
+
+    def meet(self) -> None:
+        """Have the thread that calls be one of them, from now on."""
+        self._threads.setdefault(threading.get_native_id(), False)
+
+    def begin(self) -> None:
+        """Have them be prompt for a moment; ``look`` ends it."""
+        with self._lock:
+            self._until_ns = time.monotonic_ns() + MOMENT_NS
+            for thread, is_prompt in list(self._threads.items()):
+                if not is_prompt:
+                    self._threads[thread] = _move(thread, os.SCHED_OTHER, PROMPT, 1)
+
+    def look(self) -> None:
+        """Have them be ordinary again when the moment has passed."""
+        if not self._until_ns or time.monotonic_ns() < self._until_ns:
+            return
+        with self._lock:
+            self._until_ns = 0
+            for thread, is_prompt in list(self._threads.items()):
+                if is_prompt:
+                    _move(thread, os.SCHED_FIFO, ORDINARY, 0)
+                    self._threads[thread] = False
+
+
+def _move(thread: int, before: int, policy: int, priority: int) -> bool:
+    """Give a thread of this process a class if it has that of ``before``; return whether it has it now."""
+    try:
+        os.stat(f"/proc/self/task/{thread}")  # its number may be another process's by now
+        if os.sched_getscheduler(thread) & ~os.SCHED_RESET_ON_FORK != before:
+            return False
+        os.sched_setscheduler(thread, policy, os.sched_param(priority))
+    except OSError:  # it has ended, or has no right to the class
         return False
     return True
 
@@ -62,11 +137,11 @@ class BoundedPrompt:
             self._ran_ns[thread] = ran_ns
         lasted_ns, self._looked_ns = now_ns - self._looked_ns, now_ns
         if took > SHARE * lasted_ns:
-            self._set(os.SCHED_OTHER, 0)
+            self._set(ORDINARY, 0)
             self._ordinary_until_ns = now_ns + int(ORDINARY_S * 1e9)
         elif self._ordinary_until_ns and now_ns > self._ordinary_until_ns:
             self._ordinary_until_ns = 0
-            self._set(_PROMPT, 1)
+            self._set(PROMPT, 1)
 
     def _set(self, policy: int, priority: int) -> None:
         for thread, ran_ns in list(self._ran_ns.items()):  # another thread may enter

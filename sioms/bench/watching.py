@@ -47,6 +47,15 @@ class Watch:
                 raise TimeoutError(f"watch {self._node.name} for {what}: nothing within {timeout_s:g} s")
             time.sleep(0.002)
 
+    def before(self, at_ns: int) -> Any:
+        """Return the last snapshot with a stamp up to ``at_ns``, the first one of all if there is none: a device that
+        got no processor for a while has none of the milliseconds before, and the next one is of what came then.
+        """
+        seen = self._node.history(self._after, gone=True)
+        if not seen:
+            raise TimeoutError(f"watch {self._node.name}: it has no snapshots")
+        return next((each for each in reversed(seen) if each.stamp_ns <= at_ns), seen[0])
+
 
 class Counted:
     """Looks of trials whose worst is counted: what never came has come when the look ended, and the run goes on.
@@ -83,7 +92,7 @@ def halting_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0, look_back_ns
     Raises:
         TimeoutError: an axis went on.
     """
-    before = watch.first(lambda s: True, since_ns - look_back_ns, timeout_s, "a first look").commanded_velocity
+    before = watch.before(since_ns - look_back_ns).commanded_velocity
 
     def slower(snapshot: Any) -> bool:
         pairs = zip(snapshot.commanded_velocity, before, strict=True)
@@ -97,7 +106,7 @@ def slowing_ns(watch: Watch, since_ns: int, timeout_s: float = 3.0, look_back_ns
 
     Args, Raises: as halting_ns.
     """
-    before = watch.first(lambda s: True, since_ns - look_back_ns, timeout_s, "a first look").velocity
+    before = watch.before(since_ns - look_back_ns).velocity
 
     def slower(snapshot: Any) -> bool:
         return all(abs(now) < 0.99 * abs(was) for now, was in zip(snapshot.velocity, before, strict=True))

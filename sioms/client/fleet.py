@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, Self
+
+from sioms.prompt import Briefly
+from sioms.protocol.verbs import EmergencyStop
 
 from .cell_verbs import WorkcellVerbs
 from .channel import Answer, Call
@@ -53,11 +56,13 @@ class _Together:
 
     def _send(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[int | OSError]:
         sent: list[int | OSError] = []
-        for cell, call in calls:
-            try:
-                sent.append(cell._channel.send(call))
-            except OSError as error:
-                sent.append(error)
+        is_stop = any(isinstance(call.message, EmergencyStop) for _, call in calls)
+        with Briefly() if is_stop else nullcontext():  # who hears of it here shall not hold up those who have not yet
+            for cell, call in calls:
+                try:
+                    sent.append(cell._channel.send(call))
+                except OSError as error:
+                    sent.append(error)
         return sent
 
     def _answers(

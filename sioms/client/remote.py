@@ -24,6 +24,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from typing import Any, Protocol
 
+from sioms.prompt import Briefly
 from sioms.protocol import link
 from sioms.protocol.clock import Clock, Offset, Wall
 from sioms.protocol.flags import PageState
@@ -350,7 +351,8 @@ class _Bridge:
     def _to_daemon(self, packet: bytes) -> None:
         if len(packet) > 1 and packet[1] == ClientVerb.EMERGENCY_STOP:
             self._stop = (time.monotonic() + STOP_AGAIN_S, packet)
-            self._link.stop(link.pack(Up.PACKET, body=packet))
+            with Briefly():
+                self._link.stop(link.pack(Up.PACKET, body=packet))
         else:
             self._send(Up.PACKET, 0, packet)
 

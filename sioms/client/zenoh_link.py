@@ -22,6 +22,7 @@ from weakref import WeakSet
 import zenoh
 from zenoh.handlers import Callback
 
+from sioms.prompt import Hurry
 from sioms.protocol import link
 from sioms.protocol.link import Up
 
@@ -81,7 +82,7 @@ class ZenohLink:
         except zenoh.ZError as error:  # the connection has ended meanwhile
             self.close()
             raise OSError(errno.EIO, f"{what}: the connection has ended at once: {error}") from None
-        self.stop(link.pack(Up.HELLO))
+        self._send_stop(link.pack(Up.HELLO))
 
     def _declare(self, name: str) -> None:
         """Say what is sent and taken under a name."""
@@ -107,6 +108,7 @@ class ZenohLink:
                 os.eventfd_write(self._came, 1)
 
     def _take(self, sample: zenoh.Sample) -> None:
+        _hurry.meet()
         frame = sample.payload.to_bytes()
         self._bytes += len(frame)
         self._frames.append(frame)
@@ -130,6 +132,10 @@ class ZenohLink:
 
     def stop(self, frame: bytes) -> None:
         """Send a stop ahead of all other frames."""
+        _hurry.begin()
+        self._send_stop(frame)
+
+    def _send_stop(self, frame: bytes) -> None:
         with suppress(zenoh.ZError):  # it goes the other way then
             self._stop.put(frame)
 
@@ -144,6 +150,7 @@ class ZenohLink:
 
     def lost(self, due: bool) -> str:
         """Return why the connection has ended, '' if it has not."""
+        _hurry.look()
         return self._lost
 
     def close(self) -> None:
@@ -217,6 +224,8 @@ class Opening:
             self._changed.wait_for(lambda: not self._count, OPENED_S)
 
 
+_hurry = Hurry()
+"""The threads of Zenoh in this process, which all sessions share: on the way of a stop they are prompt."""
 _opening = Opening()
 atexit.register(lambda: _opening.end())
 _open: WeakSet[ZenohLink] = WeakSet()
