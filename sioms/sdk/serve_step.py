@@ -26,7 +26,7 @@ from sioms.protocol.flags import WriteFlag
 from sioms.protocol.messages import HandleVerb
 
 MOST_WRITERS: Final = 16
-MOST_KEPT: Final = 4
+MOST_KEPT: Final = 12
 """Packets that are kept until the loop has its turn."""
 ROOM: Final = 4096
 """Bytes of such a packet at most."""

@@ -16,6 +16,7 @@ from sioms.protocol import verbs
 from sioms.protocol.messages import MalformedMessage, decode_reply, reply
 from sioms.protocol.records import AXIS_WRITE
 from sioms.sdk import attachments  # adds the decoders of a driver
+from sioms.sdk.desk import GRACE_NS
 from sioms.sdk.serve_step import MOST_KEPT, ROOM
 
 
@@ -60,7 +61,7 @@ def test_what_steps_serve_is_what_the_loop_takes_at_once(seed, request_file):
     for _ in range(400):
         queue = queue_of(chance)
         served, waiting, kept = Served(queue, request_file), 0, 0
-        for _ in range(chance.randrange(1, 7)):
+        for _ in range(chance.randrange(1, MOST_KEPT + 3)):
             packet, is_usual = next(made)
             if not packet:
                 continue
@@ -101,6 +102,19 @@ def test_both_forms_of_the_steps_do_the_same():
     compiled, plain = run(), run(**{UNCOMPILED: "1"})
     assert (compiled[0], plain[0]) == ("compiled", "python"), "./dev setup compiles the steps"
     assert compiled[1:] == plain[1:] and sum(line.startswith("True") for line in plain) > 30
+
+
+def test_a_dozen_writes_in_a_row_is_served_and_before_a_tick_may_not_wait_any_more(request_file):
+    """Each takes client and steps some 18 us, and a tick comes on time until GRACE_NS behind the first of them."""
+    queue = queue_of(random.Random(1))
+    queue.latched[:] = 0
+    queue.home_required[:] = False
+    queue.capacity = 64
+    packet = next(p for p, _ in packets(random.Random(1)) if (taken(queue, p, 0) or (0, 0))[1] == 1)
+    served = Served(queue, request_file)
+    assert [served.serve(packet) for _ in range(13)] == [*[True] * 12, False] and served.left() == packet
+    assert 12 * 18_000 < GRACE_NS
+    served.close()
 
 
 def test_a_stop_that_is_asked_for_comes_before_the_next_write(request_file):
