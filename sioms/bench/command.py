@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import signal
 import sys
 from typing import Any
@@ -126,6 +127,8 @@ def run(args: argparse.Namespace) -> int:
     if wrong:
         print(f"sioms bench: no sub-bench {wrong[0]}; there are: {', '.join(BENCHES)}", file=sys.stderr)
         return 2
+    # What is installed has its bytecode: without it, each process that a bench starts compiles all that it imports.
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
     # However we are ended, our daemons end with us.
     signal.signal(signal.SIGINT, signal.default_int_handler)
     signal.signal(signal.SIGTERM, signal.default_int_handler)
