@@ -177,7 +177,7 @@ def test_a_fleet_tells_all_of_a_stop_before_who_hears_takes_its_processor(messag
     seen = []
 
     class Cell:
-        class _channel:  # noqa: N801
+        class _channel:
             @staticmethod
             def send(call: Call) -> int:
                 seen.append(os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO)
