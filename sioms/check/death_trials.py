@@ -11,6 +11,7 @@ from typing import Any
 
 from sioms.protocol.flags import ControlMode
 
+from .device import check_armed, state_of
 from .motion_trials import REST_S, SLOW, STILL_S, check_rest, run, slowly, wait_moving
 from .rigs import Output
 from .station import Client, Station, wait_for
@@ -108,7 +109,7 @@ def driver_killed(station: Station, full: bool) -> str:
 
 
 def _kill_driver(station: Station, set_going: Callable[[Station], tuple[float, Client | None]]) -> str:
-    before = station.status()
+    before, device = station.status(), state_of(station)
     fast, client = set_going(station)
     os.kill(before["pid"], signal.SIGKILL)
     began = time.monotonic()
@@ -122,6 +123,7 @@ def _kill_driver(station: Station, set_going: Callable[[Station], tuple[float, C
     if not wait_for(lambda: station.status()["generation"] > before["generation"], GONE_S):
         raise Failed(f"a new driver process within {GONE_S:g} s", f"the device is {station.status()['state']}")
     station.wait_good()
+    check_armed(station, device, "the opening by the new driver")
     text += f"new driver good after {1e3 * (time.monotonic() - began):.0f} ms"
     _check_still(station, "the driver's death")
     return text
