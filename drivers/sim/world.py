@@ -271,6 +271,8 @@ def _body(table: ObjectTable) -> Body:
     Raises:
         ValueError: an outline that is not convex, or a number out of its range.
     """
+    if not all(map(math.isfinite, table.pose)):
+        raise ValueError(f"describe object: its pose is {list(table.pose)}; want finite numbers")
     return Body(_outline(table), table.mass, table.platen_friction)
 
 

@@ -176,6 +176,8 @@ class Skills:
         found = yield from self._sense(manner.light_n)
         if found.grasp.quality > manner.light_rad:
             self.say(f"near the friction cone: {_degrees(found.grasp)}", Fault.CONE)
+        if found.grasp.quality > math.atan(manner.friction):  # it slides, or will: what was felt has to do
+            return found
         if found.grasp.quality > manner.squeeze_rad:
             return (yield from self._sense(manner.light_n, _LIGHTLY * manner.frames))
         yield from self._settle(manner.force_n, 0.6)

@@ -229,3 +229,11 @@ def test_closing_on_one_that_is_never_met_ends() -> None:
             ticks.send(reading)
             reading = replace(reading, fingers=(one, reading.fingers[1]))
     assert failed.value.fault is Fault.NOTHING_THERE and failed.value.fault.opens
+
+
+def test_what_slides_at_a_touch_is_not_felt_any_longer() -> None:
+    """A general polygon that the second regrasp meets 77 degrees off its normal, 57 being the cone: felt on for a
+    second it slid away. It is regrasped at once, and held in the end.
+    """
+    found = carry_out(draw(9, 701, ("polygon", "hull")))
+    assert found.friction > 1.5 and found.held and not found.dropped and found.fault is None

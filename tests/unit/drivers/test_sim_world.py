@@ -153,6 +153,8 @@ def test_a_finger_that_takes_all_round_objects_shows_each_as_its_own_table_would
         ({"shape": "polygon", "points_m": [[0, 0], [0, 0.01], [0.01, 0]]}, "anti-clockwise"),
         ({"shape": "rectangle", "size_m": [0.02, 0.03], "corner_m": 0.02}, "nothing of a side"),
         ({"mass": 0.0}, "mass"),
+        ({"pose": [math.nan, 0.0, 0.0]}, "its pose is"),
+        ({"pose": [0.0, 0.0, math.inf]}, "want finite numbers"),
     ],
 )
 def test_objects_that_cannot_be_are_refused(change, wrong):
