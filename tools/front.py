@@ -88,9 +88,14 @@ def main(words: Sequence[str] | None = None) -> int:
     else:
         for name, command in there.items():
             subparsers.add_parser(name, help=command.text)
-    args, rest = parser.parse_known_args(words)
-    if rest:
-        _innermost(parser, words).error(f"unrecognized arguments: {' '.join(rest)}")
+    try:
+        args, rest = parser.parse_known_args(words)
+        if rest:
+            _innermost(parser, words).error(f"unrecognized arguments: {' '.join(rest)}")
+    except SystemExit as end:
+        if end.code == USAGE and wanted == "stop":
+            _stop_all_the_same()
+        raise
     if args.version:
         from .manual import answer
 
@@ -102,6 +107,8 @@ def main(words: Sequence[str] | None = None) -> int:
     return _guarded(wanted, module, args)
 
 
+USAGE = 2
+"""Exit status of a command line that cannot be read."""
 LEAVES = ("serve",)
 """Commands whose libraries keep threads that would run on while the interpreter ends, whatever ends the command."""
 EXTRAS = {
@@ -178,6 +185,18 @@ def _guarded(name: str, module: Any, args: argparse.Namespace) -> int:
             text = f"{error.filename}: {text.lower()}"
         print(f"sioms {name}: {text}", file=sys.stderr)
         return 1
+
+
+def _stop_all_the_same() -> None:
+    """Stop the workcell: whoever mistypes the options of a stop wants less motion, not more."""
+    from sioms.client.stopping import emergency_stop
+
+    try:
+        emergency_stop("sioms stop, with options that there are not", name="sioms")
+    except OSError as error:
+        print(f"sioms stop: {error.strerror}", file=sys.stderr)
+    else:
+        print("sioms stop: the whole workcell has been stopped", file=sys.stderr)
 
 
 def _run_and_leave(name: str, module: Any, args: argparse.Namespace) -> NoReturn:

@@ -184,6 +184,7 @@ def test_a_stop_by_a_name_that_no_node_has_stops_all(daemon: Daemon, cell: sioms
         ("sdev", ["-e", "mod0", "mod1"], 2),
         ("sdev", ["-qe", "mod0"], 2),
         ("sdev", ["mod0", "--emergency-stop"], 2),
+        ("front", ["stop", "-all"], 2),
         ("front", ["stop", "mod0", "mod1"], 0),
         ("front", ["stop", "mod0", "mod9", "mod1"], 1),
     ],
