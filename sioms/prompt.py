@@ -14,6 +14,7 @@ ORDINARY_S = 1.0
 """How long they are ordinary ones when they have taken more [s]."""
 ORDINARY, PROMPT = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK, os.SCHED_FIFO | os.SCHED_RESET_ON_FORK
 """Classes of threads. Who is not privileged may leave the real-time class, and may not take back the flag."""
+_LEAST, _NONE = os.sched_param(1), os.sched_param(0)
 MOMENT_NS = 50_000_000
 """How long threads of a library that pass a stop on are prompt [ns]."""
 
@@ -43,18 +44,22 @@ class Briefly:
     _entered = False
 
     def __enter__(self) -> Self:
-        with suppress(OSError):
-            if os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
-                self._before = os.sched_getscheduler(0)
-                os.sched_setscheduler(0, os.SCHED_FIFO | self._before, os.sched_param(1))
+        try:
+            self._before = os.sched_getscheduler(0)
+            if self._before & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER:
                 self._entered = True
+                os.sched_setscheduler(0, os.SCHED_FIFO | self._before, _LEAST)
+        except OSError:
+            self._entered = False
+        except BaseException:  # of a signal's handler: nobody would call __exit__
+            self.__exit__()
+            raise
         return self
 
     def __exit__(self, *_: object) -> None:
         if self._entered:
+            os.sched_setscheduler(0, self._before, _NONE)  # back, and with the flag that it had: it is never refused
             self._entered = False
-            with suppress(OSError):
-                os.sched_setscheduler(0, self._before, os.sched_param(0))
 
 
 class Hurry:

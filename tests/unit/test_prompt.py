@@ -139,6 +139,21 @@ def test_a_thread_is_prompt_for_a_block_only_and_keeps_a_class_of_its_own() -> N
 
 
 @pytest.mark.usefixtures("in_a_thread")
+def test_an_interrupted_thread_is_not_left_prompt(monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.sched_setscheduler
+
+    def interrupted(thread: int, policy: int, param: os.sched_param) -> None:
+        real(thread, policy, param)
+        if policy & ~os.SCHED_RESET_ON_FORK == os.SCHED_FIFO:
+            raise KeyboardInterrupt  # of a signal whose handler runs here
+
+    monkeypatch.setattr(prompt.os, "sched_setscheduler", interrupted)
+    with pytest.raises(KeyboardInterrupt), Briefly():
+        pass
+    assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER
+
+
+@pytest.mark.usefixtures("in_a_thread")
 def test_threads_of_a_library_are_prompt_for_a_moment(monkeypatch: pytest.MonkeyPatch) -> None:
     hurry, met, ends = Hurry(), threading.Event(), threading.Event()
 
