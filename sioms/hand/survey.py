@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,7 @@ MEAN_S, DRAGGED_S = 1.0, 0.3
 """How long what is told is averaged in a hold, and while fingers slide [s]: forces and commands swing by some per cent
 about once a second, and a drive that moves bears by its damping what its stiffness does not."""
 DRAG, DRAG_S = 5e-3, 0.6  # speed at which fingers are dragged along a clamped bar [m/s], and for how long first
+EVEN = 0.01  # velocity along the line of centres for a difference of both loads [m/(s N)]
 TRIES = 3  # grasps that fail one after the other
 #: What a hand's devices tell by themselves: x1, y1, th1, x2, y2, th2 as the encoders read them, places, loads, the same
 #: joints as commanded, and the wrists' forces fx1, fy1, fx2, fy2 [m, rad, N]; nan where not known.
@@ -190,15 +192,32 @@ class Survey(Skills):
         psi, sign = self._goal[2], 1.0 if number % 2 else -1.0
         along = (-sign * DRAG * math.sin(psi), sign * DRAG * math.cos(psi), 0.0, 0.0, 0.0, 0.0)
         for force in setting.loads:
-            yield from self._settle(force, 0.5)
-            begun_s = self.now.time_s
-            while self.now.time_s - begun_s < DRAG_S:
-                yield from self._follow(along, force)
+            yield from self._even(STILL, force, SETTLED_S)
+            yield from self._even(along, force, DRAG_S)
             for finger in (1.0, 2.0):
-                row = yield from self._record(force, told, number, along, DRAGGED_S)
+                row = yield from self._record(force, told, number, partial(self._evenly, along, force), DRAGGED_S)
                 self.rows.append([*row[:-1], finger])
         yield from self._open()
         return list(middle)
+
+    def _even(self, along: Sequence[float], force: float, time_s: float) -> Generator[Setpoint, Reading, None]:
+        """Move for a time [s], both fingers bearing alike."""
+        begun_s = self.now.time_s
+        while self.now.time_s - begun_s < time_s:
+            yield from self._evenly(along, force)
+
+    def _evenly(self, along: Sequence[float], force: float) -> Generator[Setpoint, Reading, None]:
+        """Move for a tick, the hand being put, along the line of centres, where both fingers bear alike.
+
+        What is clamped gives way to neither finger: a hand that would be elsewhere presses ever more with one.
+        """
+        one, two = self.now.fingers
+        at, u, v = self.hand.forward(self.now.joints), math.cos(self._goal[2]), math.sin(self._goal[2])
+        off = (at[0] - self._goal[0]) * u + (at[1] - self._goal[1]) * v
+        self._goal[0] += off * u
+        self._goal[1] += off * v
+        shift = EVEN * (two.force - one.force)
+        yield from self._follow((along[0] + shift * u, along[1] + shift * v, *along[2:]), force)
 
     def _take(self, middle: Sequence[float], phi: tuple[float, float]) -> Generator[Setpoint, Reading, None]:
         """Roll the fingers, and close lightly about a place."""
@@ -217,9 +236,10 @@ class Survey(Skills):
             yield from self._follow((0.0, 0.0, math.copysign(min(rate, 3.0 * abs(left)), left), 0.0, 0.0, 0.0), force)
 
     def _record(
-        self, force: float, told: Told, number: int, along: Sequence[float] = STILL, time_s: float = MEAN_S
-    ) -> Generator[Setpoint, Reading, list[float]]:
-        """Average what is told for a time [s] while the hand keeps still, or slides evenly; return a row.
+        self, force: float, told: Told, number: int,
+        move: Callable[[], Generator[Setpoint, Reading, None]] | None = None, time_s: float = MEAN_S,
+    ) -> Generator[Setpoint, Reading, list[float]]:  # fmt: skip
+        """Average what is told for a time [s] while the hand keeps still, or moves by ticks of its own; return a row.
 
         Raises:
             Failed: a finger is doubtful in more than half of the frames.
@@ -227,7 +247,7 @@ class Survey(Skills):
         self.state, begun_s, count = State.SENSE, self.now.time_s, 0
         frames = []
         while self.now.time_s - begun_s < time_s or count < self.manner.frames:
-            yield from self._follow(along, force)
+            yield from self._follow(STILL, force) if move is None else move()
             count += 1
             one, two = self.now.fingers
             if one.touched and two.touched and not one.doubt and not two.doubt:

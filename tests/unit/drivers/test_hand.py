@@ -18,7 +18,8 @@ from sioms.hand.felt import no_shape
 from sioms.hand.follow import D
 from sioms.hand.kinematics import Hand
 from sioms.hand.model import model_of, to_toml
-from sioms.hand.touch import Felt
+from sioms.hand.survey import BAR, COLUMNS, Survey, Thing, settings
+from sioms.hand.touch import Felt, Manner
 from sioms.motion import CommandError
 from sioms.motion.commands import WIRE_DTYPE
 from sioms.protocol.flags import AnalogStatus, AxisStatus, ControlMode
@@ -249,3 +250,31 @@ def test_a_wrist_whose_force_is_invalid_is_not_taken_for_no_contact() -> None:
     held.advance(0.02)
     assert "wrist2: its force is invalid" in held.bank.fault_text(D)
     assert held.coordinates[D] == pytest.approx(before, abs=1e-4)
+
+
+def test_both_fingers_bear_alike_while_they_slide_along_what_is_clamped() -> None:
+    """Held where the bar is not, by a millimetre, the hand pressed with one finger alone after a second."""
+
+    def clamped(tables: dict[str, Any]) -> None:
+        tables["world"]["object"] = {
+            "shape": "rectangle", "size_m": [0.03, 0.08], "corner_m": 2e-3, "pose": [1e-3, -2e-3, 0.0], "mass": 50.0,
+            "platen_friction": 5.0,
+        }  # fmt: skip
+        for side, sign in (("left", -1.0), ("right", 1.0)):
+            tables[side]["axis"][0]["motor"]["start"] = sign * 0.0317
+        for sensor in ("touch1", "touch2", "wrist1", "wrist2"):
+            tables[sensor]["tick_hz"] = 100.0
+
+    cell = HandCell(clamped, compiled=False)
+    cell.advance(2.0)
+    cell.reading = cell._read()
+    survey = Survey(cell.hand, cell.reading, Thing(BAR, 0.03), Manner(light_n=0.4, frames=10))
+    told = [0.0] * 20
+
+    def feel() -> list[float]:
+        told[8:10] = [finger.normal for finger in cell.world.fingers]
+        return told
+
+    assert cell.run(survey.slide(settings(1, (0.8,)), feel)) == 1, survey.events
+    loads = np.array(survey.rows)[:, [COLUMNS.index("load1"), COLUMNS.index("load2")]]
+    assert loads == pytest.approx(np.full((2, 2), 0.8), rel=0.3)
