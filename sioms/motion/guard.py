@@ -26,10 +26,15 @@ class LimitGuard:
     mode the measured state is watched, of velocity too, and the axis goes over to a position-held
     stop that presses no harder than the force that was asked for (force_end.py), and says so: FORCE_ENDED. Concurrency:
     that of the bank.
+
+    Args:
+        queue, sequencer: of the bank.
+        speed_most: speed at which a force ends, by axis [unit/s]: that of its command, else the limit of the axis.
     """
 
-    def __init__(self, queue: CommandQueue, sequencer: Sequencer) -> None:
+    def __init__(self, queue: CommandQueue, sequencer: Sequencer, speed_most: NDArray[np.float64]) -> None:
         self._queue = queue
+        self._speed_most = speed_most
         self._limits = queue.limits
         self._sequencer = sequencer
 
@@ -48,7 +53,7 @@ class LimitGuard:
         if force.any():
             state[force] = sequencer.state(axes[force], now_ns)[:, :2]
         side = self._beyond(axes, state)
-        hit = (side != 0) | (force & (np.abs(state[:, 1]) > self._limits.velocity[axes]))
+        hit = (side != 0) | (force & (np.abs(state[:, 1]) > self._speed_most[axes]))
         if not hit.any():
             return False
         for bit, sign in ((AxisStatus.LIMIT_MINUS, -1), (AxisStatus.LIMIT_PLUS, 1)):

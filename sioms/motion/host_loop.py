@@ -72,8 +72,7 @@ class AxisBank(Bank):
         self._law = ControlLaw(
             settings, tick_s, raw=self._raw, offset=self._offset, position=self._position, velocity=self._velocity,
             present=store.present, segment_ns=store.segment_ns,
-            minimum=limits.minimum, maximum=limits.maximum, speed_most=limits.velocity,
-            deceleration=limits.acceleration,
+            minimum=limits.minimum, maximum=limits.maximum, deceleration=limits.acceleration,
             k=rows["k"], kz=rows["kz"], kp=rows["kp"], kb=rows["kb"], desired=self._desired,
             desired_velocity=self._desired_velocity, following=self._following, force=self._force,
             status=self._status, buffered=self._buffered, latched=queue.latched, waiting=queue.waiting,
@@ -90,7 +89,7 @@ class AxisBank(Bank):
         self.plans = self._sequencer.plans(self._braked)
         self._braked_ns = 0
         """When the stop of these axes began [ns]; 0: there are none."""
-        self._guard = LimitGuard(self._queue, self._sequencer)
+        self._guard = LimitGuard(self._queue, self._sequencer, self._law.speed_most)
         self._homing = HomingRuns(settings, self._queue, self)
         self._motion_watch = HostWatch(settings, tick_s, self._law)
         arrays = self.arrays = self._law.arrays

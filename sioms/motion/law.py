@@ -36,6 +36,7 @@ class ControlLaw:
         anchor: what output positions count from: the raw output is slewed - anchor.
         kind, guard, begun, event_status: the sequencer's.
         limp: axes that are let go.
+        speed_most: speed at which a force command ends.
         actuator: what the actuators shall do.
     """
 
@@ -75,6 +76,8 @@ class ControlLaw:
         self.force_limit: Vector = arrays["force_limit"]
         self.velocity_limit: Vector = arrays["velocity_limit"]
         self.acceleration_limit: Vector = arrays["acceleration_limit"]
+        self.speed_most: Vector = arrays["speed_most"]
+        self.speed_most[:] = self.velocity_limit
         self.output: Vector = arrays["output"]
         self.slewed: Vector = arrays["slewed"]
         self.anchor: Vector = arrays["anchor"]

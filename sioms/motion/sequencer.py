@@ -432,6 +432,9 @@ class Sequencer:
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
         self.kind[axes] = self._row_kind[rows]
+        pressing = axes[self.kind[axes] == FORCE]
+        if pressing.size:
+            self._law.speed_most[pressing] = self._limits.velocity[pressing]
         self.guard[axes] = self._row_guard[rows]
         self.outcome[axes] = 0
         self.stopped[axes] = False
@@ -458,6 +461,8 @@ class Sequencer:
         if mode & modes.MAX_VEL_ACC:
             self._velocity_limit[axis] = command.max_velocity
             self._acceleration_limit[axis] = command.max_acceleration
+            if self.kind[axis] == FORCE:
+                law.speed_most[axis] = command.max_velocity
 
     def _rest(self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
         """Nothing follows: hold the axes at rest, brake the others."""

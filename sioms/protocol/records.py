@@ -75,7 +75,11 @@ class AxisWrite:
         "{u}/s^2", "acceleration, or with a velocity the greatest one", ControlMode.ACCELERATION
     )
     jerk: float = _real("{u}/s^3", "jerk", ControlMode.JERK)
-    max_velocity: float = _real("{u}/s", "greatest velocity from now on", ControlMode.SPECIFIED_MAX_VEL_ACC)
+    max_velocity: float = _real(
+        "{u}/s",
+        "greatest velocity from now on; a force that is commanded with it ends at this speed",
+        ControlMode.SPECIFIED_MAX_VEL_ACC,
+    )
     max_acceleration: float = _real("{u}/s^2", "greatest acceleration from now on", ControlMode.SPECIFIED_MAX_VEL_ACC)
     time: float = _real("s", "duration; below 0 it lasts until the next command", ControlMode.SPECIFIED_TIME)
     k: float = _real("", "gain k of the control law", ControlMode.SPECIFIED_GAINS)

@@ -514,6 +514,23 @@ def test_an_emergency_stop_of_a_force_brakes_what_moves_and_then_presses_no_more
     assert rig.bank.is_idle([0]) and abs(rig.field("velocity")) < 0.005
 
 
+def test_a_force_ends_at_the_velocity_that_its_command_allows() -> None:
+    """It met nothing: so far it ran up to the limit of the axis. The next one without such a limit has that again."""
+    rig = Rig([axis(velocity_max=0.5, acceleration_max=2.0, force_max=50.0, k=4e4, kz=-0.95, kb=-4.0)])
+    rig.plant = Wall(9.0).before(rig)
+    slow = MODE.FORCE | MODE.SPECIFIED_MAX_VEL_ACC
+    for mode, fastest in ((slow, 0.05), (MODE.FORCE, 0.5), (slow, 0.05)):
+        rig.write(mode=mode, force=4.0, max_velocity=0.05, max_acceleration=1.0)
+        velocities = []
+        for _ in range(1500):
+            rig.tick()
+            velocities.append(rig.field("velocity"))
+        assert fastest < max(velocities) < 1.3 * fastest, mode
+        assert dropped(rig)[-1] == ((0,), errno.ERANGE) and rig.field("status") & S.FORCE_ENDED
+        rig.bank.set_limits([0], velocity_max=0.5)
+        assert rig.bank.is_idle([0])
+
+
 def test_the_bound_of_a_force_is_lifted_at_rest() -> None:
     """What is held then is held with all there is; a zero force that is stopped in motion holds, too."""
     for force in (3.0, 0.0):
