@@ -57,6 +57,10 @@ def is_point_move(mode: Any) -> Any:
     return (mode & mask) == quantity
 
 
+LONGEST_MOVE_S = 7600.0
+"""No longer move to a position is planned (error -101 of Ruckig)."""
+
+
 class Limits:
     """Limits of every axis as arrays (n,), absent ones infinite.
 
@@ -284,13 +288,16 @@ class Validator:
         bad = timed & ((time == 0) | (time > 1e6))
         passing = int(M.POSITION | M.VELOCITY)
         bad |= timed & (time < 0) & ((mode & passing) == passing)
+        moves = timed & ((mode & int(M.POSITION)) != 0)
+        bad |= moves & (time > LONGEST_MOVE_S)
         if bad.any():
             i = int(bad.argmax())
+            most = f"{LONGEST_MOVE_S:g}" if moves[i] else "1e6"
             raise self.refuse(
                 errno.EINVAL,
                 commands,
                 i,
-                f"time {time[i]:g} s; more than 0 and at most 1e6 s, or negative for "
+                f"time {time[i]:g} s; more than 0 and at most {most} s, or negative for "
                 "'until the next command' (not with a position that is passed)",
             )
 

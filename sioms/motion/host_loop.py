@@ -167,7 +167,8 @@ class AxisBank(Bank):
     def _halt(self, axes: Axes, now_ns: int, *, fastest: bool) -> None:
         """Brake; in force mode the controlled stop holds, the fastest one lets go until reset(), when it has braked."""
         brakes, self._braked_ns = self._braked_ns > 0, 0
-        in_force = axes[self._sequencer.kind[axes] == FORCE] if fastest else axes[:0]
+        bound = self._law.force_ends.is_bound(axes)  # also one that brakes since it has left force mode
+        in_force = axes[(self._sequencer.kind[axes] == FORCE) | bound] if fastest else axes[:0]
         self._homing.cancel(axes)
         self._sequencer.halt(axes, now_ns, brakes=brakes)
         if in_force.size:

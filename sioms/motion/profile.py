@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import ruckig
 
 from . import modes
-from .commands import Command
+from .commands import LONGEST_MOVE_S, Command
 
 MAX_SEGMENTS = 23
 """Two brake phases, seven of the profile, two of arrival; nine of a take-up; a hold, two to spare."""
@@ -200,6 +200,8 @@ class Planner:
                 result = self._otg.calculate(given, self._trajectory)
             except ruckig.RuckigError as error:
                 reason = reason or str(error).replace("\n", " ").replace("[ruckig] ", "").strip()
+            except ValueError:  # a result that its Python side has no name for: the duration
+                reason = f"no profile of that duration; a move may last {LONGEST_MOVE_S:g} s at most"
             else:
                 if result in DONE:
                     break

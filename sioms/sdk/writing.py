@@ -224,7 +224,8 @@ class AxesWrite:
         """What replaces the buffer also replaces what is on its way into it."""
         writing = self._handle.writing
         older = writing[: writing.index(self)] if self in writing else writing
-        end_writes(self._service, older, "replaced by a later write")
+        replaced = [write for write in older if not self.axes.isdisjoint(write.axes)]
+        end_writes(self._service, replaced, "replaced by a later write")
 
     def _refusal(self, errno_: int, text: str) -> OSError:
         return OSError(errno_, f"write {self._handle.node}: {text}")

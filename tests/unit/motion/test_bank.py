@@ -409,6 +409,18 @@ def test_an_emptied_buffer_says_nothing_about_where_the_next_command_begins():
     assert rig.field("commanded_position") < 2.5
 
 
+def test_a_move_that_lasts_longer_than_can_be_planned_is_refused():
+    rig = Rig([axis()])
+    for mode in (MODE.POSITION, MODE.POSITION | MODE.VELOCITY):
+        with pytest.raises(CommandError, match="8000 s; more than 0 and at most 7600 s") as refused:
+            rig.write(mode=mode | MODE.SPECIFIED_TIME, position=0.4, time=8000.0)
+        assert refused.value.errno == errno.EINVAL
+    rig.write(mode=MODE.POSITION | MODE.SPECIFIED_TIME, position=0.4, time=7599.0)
+    rig.write(mode=MODE.VELOCITY | MODE.SPECIFIED_TIME, velocity=0.0, time=8000.0)
+    rig.tick(5)
+    assert not rig.bank.fault_text(0)
+
+
 def test_flush_lets_the_running_command_end():
     rig = Rig([axis()])
     rig.write(mode=[MODE.POSITION, MODE.POSITION], position=[0.5, 1.0])
@@ -490,7 +502,10 @@ def test_what_follows_a_force_presses_no_harder_than_the_force(force: float, way
 
 @pytest.mark.parametrize("way", [0.02, 0.06, 1.0])
 @pytest.mark.parametrize("ticks", [110, 2000])
-def test_an_emergency_stop_of_a_force_brakes_what_moves_and_then_presses_no_more(way: float, ticks: int) -> None:
+@pytest.mark.parametrize("stops_first", [False, True])
+def test_an_emergency_stop_of_a_force_brakes_what_moves_and_then_presses_no_more(
+    way: float, ticks: int, stops_first: bool
+) -> None:
     """In free space there is next to no friction: nothing else would brake it."""
     rig = Rig([axis(velocity_max=0.5, acceleration_max=2.0, force_max=50.0, k=4e4, kz=-0.95, kb=-4.0)])
     wall = Wall(way, viscous=1e-3 if way == 1.0 else 5.0)
@@ -498,6 +513,9 @@ def test_an_emergency_stop_of_a_force_brakes_what_moves_and_then_presses_no_more
     rig.write(mode=MODE.FORCE, force=4.0)
     rig.tick(ticks if way < 1.0 else 110)
     velocity, place = rig.field("velocity"), rig.field("position")
+    if stops_first:
+        rig.bank.stop([0], rig.now_ns)
+        rig.tick(5)
     rig.bank.emergency_stop([0], rig.now_ns)
     presses = []
     for _ in range(900):

@@ -67,6 +67,22 @@ def test_a_stop_of_one_axis_ends_no_write_to_another(world: World) -> None:
     assert owner.answers["y"].errno == errno.ECANCELED
 
 
+def test_what_replaces_the_buffer_of_one_axis_ends_no_write_to_another(world: World) -> None:
+    owner = Owner(world)
+    owner.fill("y", 1)
+    owner.tick()
+    record = AXIS_WRITE.pack(*({"control_mode": int(ControlMode.VELOCITY)}.get(n, 0) for n in WRITE[NodeClass.AXIS]))
+    owner.send("x", owner.client.node._write(record, 0.0, True))
+    owner.tick()
+    assert type(owner.answers["x"]) is int and "y" not in owner.answers
+    record = AXIS_WRITE.pack(
+        *({"axis": 1, "control_mode": int(ControlMode.VELOCITY)}.get(n, 0) for n in WRITE[NodeClass.AXIS])
+    )
+    owner.send("y anew", owner.client.node._write(record, 0.0, True))
+    owner.tick()
+    assert owner.answers["y"].errno == errno.ECANCELED
+
+
 def test_one_axis_is_idle_whatever_is_on_its_way_to_another(world: World) -> None:
     owner = Owner(world)
     owner.fill("y", 1)
