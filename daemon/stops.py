@@ -114,7 +114,7 @@ class Stops:
         now_ns = time.monotonic_ns()
         self._nodes_stopped_ns |= dict.fromkeys(_channels(node), now_ns)
         try:
-            self._order(node, driver_verbs.NodeStop(*_parts(node), source, self._shared.latch.resets))
+            self._order(node, driver_verbs.NodeStop(*_parts(node), source, self._shared.latch.resets, now_ns))
         finally:
             self._note(self._node_entry(node, source, stop=True))
             self._cell.log("warning", "emergency stop", node=node.name, source=source)
@@ -195,7 +195,8 @@ class Stops:
                 if number >= 0 and channel < len(channels := device.info.blocks[number].channels):
                     channels_of.setdefault((number, bit if channels[channel].width else -1), []).append(channel)
             for (number, bit), stopped in channels_of.items():
-                device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), self._shared.latch.resets))
+                resets, now_ns = self._shared.latch.resets, time.monotonic_ns()
+                device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), resets, now_ns))
                 self._shared.latch.ordered()
             self._cell.log("warning", "emergency stop", node=entry[NODE], source=entry["by"], heard_by=entry[PID])
 

@@ -82,6 +82,7 @@ from sioms.protocol.messages import MAX_PACKET, ClientVerb, HandleVerb, decode, 
 from sioms.protocol.records import BINARY_WRITE
 from sioms.protocol.stopfile import open_stop_request
 from sioms.sdk.blocks import AxisBlock
+from sioms.sdk.timestamps import Timestamps
 from sioms.turns import Turns
 
 
@@ -568,6 +569,7 @@ def cells() -> Iterator[Callable[[], Cell]]:
         patch.setattr(time, "monotonic_ns", CLOCK)
         patch.setattr(time, "sleep", lambda _: None)
         patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
+        patch.setattr(Timestamps, "monotonic_ns", lambda *_: CLOCK())  # a request is served as soon as it is sent
         patch.setattr(sioms.daemon.clients, "Users", Users)
         patch.setattr(sioms.daemon.clients, "peer_of", _peer_of)
         patch.setattr(sioms.daemon.clients, "pidfd_of", _pidfd_of)

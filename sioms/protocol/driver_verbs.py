@@ -94,6 +94,7 @@ class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
     """Emergency stop of some channels, or of one bit of them (-1: all).
 
     ``resets`` is how often the workcell had been reset; after a later reset what moves stops, and is not latched.
+    ``at_ns`` is when it was sent: what clients have sent before to reset these channels is not taken any more.
     """
 
     block: Integer
@@ -101,6 +102,7 @@ class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
     bit: Integer
     source: Text
     resets: Integer
+    at_ns: Integer
 
 
 class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):

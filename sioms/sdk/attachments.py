@@ -257,7 +257,9 @@ class Attachments:
         if handle.number not in self.handles:
             return  # that was the order
         try:
-            if _acts(message) and (number == handle.stale_write or self._is_stale(handle, message, came)):
+            if isinstance(message, verbs.Ioctl) and message.request == Request.RESET:
+                self._refuse_late_reset(handle, message, came)
+            elif _acts(message) and (number == handle.stale_write or self._is_stale(handle, message, came)):
                 raise OSError(
                     errno.ECANCELED, f"{_what(message)} {handle.node}: sent before the last reset; send it again"
                 )
@@ -278,10 +280,24 @@ class Attachments:
         if came.resets == resets.count:
             return False
         reset_ns = resets.latest_ns(handle.block, concerned(handle, message), handle.number)
+        return self._sent_ns(handle, came) < reset_ns
+
+    def _refuse_late_reset(self, handle: Handle, message: verbs.Message, came: Came) -> None:
+        """Refuse a reset of what somebody else has stopped after it had been sent.
+
+        Raises:
+            OSError: EAGAIN.
+        """
+        asked_ns = self._service.stops.asked.latest_ns(handle.block, concerned(handle, message), handle.number)
+        if asked_ns and self._sent_ns(handle, came) < asked_ns:
+            text = f"{_what(message)} {handle.node}: stopped after this was sent; see why, and reset again"
+            raise OSError(errno.EAGAIN, text)
+
+    def _sent_ns(self, handle: Handle, came: Came) -> int:
+        """Return when a packet was sent [ns, CLOCK_MONOTONIC], or before."""
         sent_ns = self.timestamps.monotonic_ns(came.timestamp_ns)
-        if handle.passed_on:  # a gateway has received it before, and has told when it was sent at the earliest
-            sent_ns = min(sent_ns, handle.heard_ns)
-        return sent_ns < reset_ns
+        # A gateway has received it before, and has told when it was sent at the earliest.
+        return min(sent_ns, handle.heard_ns) if handle.passed_on else sent_ns
 
     def _note(self, handle: Handle, packet: bytes, errno_: int, why: str) -> None:
         """Note a command, after its answer has been sent: a client does not wait for that."""

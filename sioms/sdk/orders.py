@@ -79,7 +79,7 @@ class Orders:
         is_over = order.resets != self._latch.resets  # the workcell has been reset since then
         if isinstance(order, driver_verbs.NodeStop):
             stop = self._stops.stop_in_passing if is_over else self._stops.stop_node
-            stop(block, order.channels, order.bit, order.source)
+            stop(block, order.channels, order.bit, order.source, order.at_ns)
         elif not is_over:
             try:
                 self._stops.reset_node(block, order.channels, order.bit, "reset", order.at_ns)

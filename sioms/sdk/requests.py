@@ -62,7 +62,7 @@ def ioctl(
     match request:
         case Request.EMERGENCY_STOP:
             source = f"{handle.who} on {handle.node}"
-            service.stops.stop_node(handle.block, handle.channels, handle.bit, source)
+            service.stops.stop_node(handle.block, handle.channels, handle.bit, source, by=handle.number)
             return service.stops.note_node(handle, source, stop=True)
         case Request.RESET:
             if argument is not None and (type(argument) is not int or argument < 0):

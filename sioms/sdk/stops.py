@@ -31,7 +31,7 @@ from .engine import Engine
 from .handles import Handle, Waits
 from .outputs import WHOLE, Outputs, safe_of
 from .pages import Pages
-from .reset_times import ResetTimes
+from .part_times import PartTimes
 
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
@@ -90,6 +90,7 @@ class Stops:
         engine: of the device; set before the first tick.
         stopped: whether the workcell is stopped.
         resets: when what was stopped was reset.
+        asked: when somebody asked for the stop of a node, stopped already or not.
         latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit
             0 for channels without bits.
     """
@@ -103,7 +104,7 @@ class Stops:
         events: JournalWriter,
     ) -> None:  # fmt: skip
         self.stopped = False
-        self.resets = ResetTimes()
+        self.resets, self.asked = PartTimes(), PartTimes()
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._faulty: set[tuple[int, int]] = set()
         self._unsafe: dict[int, tuple[int, int]] = {}
@@ -220,7 +221,7 @@ class Stops:
         return ended_ns not in (before_ns, seen_stop_ns)
 
     def _note_reset(self, block: AnyBlock, stopped: Sequence[tuple[int, int]], at_ns: int, by: int = 0) -> None:
-        """Note when parts of a block, that are stopped or in fault, were reset; see ``ResetTimes.note``."""
+        """Note when parts of a block, that are stopped or in fault, were reset; see ``PartTimes.note``."""
         if not stopped:
             return
         self.resets.note(block, stopped, at_ns, by)
@@ -349,20 +350,29 @@ class Stops:
 
     # --- nodes -----------------------------------------------------------------------------------
 
-    def stop_node(self, block: AnyBlock, channels: Any, bit: int, source: str) -> None:
-        """Emergency stop of some channels, or of one bit of them: latched until reset."""
+    def stop_node(
+        self, block: AnyBlock, channels: Any, bit: int, source: str, at_ns: int | None = None, by: int = 0
+    ) -> None:  # fmt: skip
+        """Emergency stop of some channels, or of one bit of them: latched until reset.
+
+        Args:
+            block, channels, bit: what is stopped.
+            source: who asks for it, and why.
+            at_ns: when that was asked for [ns, CLOCK_MONOTONIC]; None: now.
+            by: number of the handle that asks for it; 0: none.
+        """
+        parts = [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
+        self.asked.note(block, parts, time.monotonic_ns() if at_ns is None else at_ns, by)
         if not isinstance(block, AxisBlock):
-            for channel in channels:
-                for part in parts_of(int(channel), bit, block.spec.channels[channel].width):
-                    self.latched_outputs[id(block), *part] = source
+            self.latched_outputs |= {(id(block), *part): source for part in parts}
         self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
 
-    def stop_in_passing(self, block: AnyBlock, channels: Any, bit: int, source: str) -> None:
+    def stop_in_passing(self, block: AnyBlock, channels: Any, bit: int, source: str, at_ns: int) -> None:
         """Carry out an emergency stop, as ``stop_node``, that a reset of the workcell has ended before it was heard of:
         what moves stops, what was sent before is not taken, and nothing stays latched that was not before.
         """
         before = set(self._stopped_of(block, channels, bit))
-        self.stop_node(block, channels, bit, source)
+        self.stop_node(block, channels, bit, source, at_ns)
         stopped = [part for part in self._stopped_of(block, channels, bit) if part not in before]
         self._note_reset(block, stopped, self._latch.reset_ns)
         self._clear(block, stopped)

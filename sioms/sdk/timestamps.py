@@ -21,7 +21,7 @@ _TIMESPEC = 16
 _ROOM = socket.CMSG_SPACE(_TIMESPEC)
 _DOUBT_NS = 10_000_000_000
 """Timestamps are of no use for so long after the clock was set: they may be from before [ns]."""
-_AT_ONCE_NS = 100_000
+_AT_ONCE_NS = 20_000
 """Within so long two clocks are looked at, unless the process has to wait in between [ns]."""
 _TRIES = 10
 

@@ -52,7 +52,8 @@ def _reset(process: Process, chance: random.Random) -> None:
 
 
 def _order(process: Process, chance: random.Random) -> None:
-    process.order(chance.choice(process.devices), DriverVerb.NODE_STOP, 0, [0], -1, "eva", process.latch.resets)
+    about = 0, [0], -1, "eva", process.latch.resets, CLOCK.now_ns
+    process.order(chance.choice(process.devices), DriverVerb.NODE_STOP, *about)
     process.latch.ordered()
 
 

@@ -196,7 +196,7 @@ def _axis_acts(
         state = promises.withdraw("motion", "queue", "gate", "place", "gains", "latch")
         done = promises.make(state, "emergency stop", latch=latched, motion=halting, queue=lambda s: s.buffered[0] == 0)
         if by_daemon:
-            world.order(DriverVerb.NODE_STOP, 0, [number], -1, "somebody", world.latch.resets)
+            world.order(DriverVerb.NODE_STOP, 0, [number], -1, "somebody", world.latch.resets, CLOCK())
             done(None)
         else:
             owner.ioctl(Request.EMERGENCY_STOP, None, done)
@@ -293,7 +293,7 @@ def test_outputs_that_the_next_tick_sets(make_world: Any) -> None:
         if world.chance.random() < 0.5:
             owner.ioctl(Request.EMERGENCY_STOP, None, promises.make(state, "stop", data=lambda s: s.data[0] == 0))
         else:
-            world.order(DriverVerb.NODE_STOP, 0, [0], -1, "somebody", world.latch.resets)
+            world.order(DriverVerb.NODE_STOP, 0, [0], -1, "somebody", world.latch.resets, CLOCK())
             promises.make(state, "stop by the daemon", data=lambda s: s.data[0] == 0)(None)
 
     def reset() -> None:

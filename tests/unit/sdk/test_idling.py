@@ -104,7 +104,7 @@ def test_an_order_a_stop_and_an_input_wake_it() -> None:
         for _ in range(1100):
             world.tick()
         assert periods(world) == 40
-        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets)
+        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets, CLOCK())
         world.runtime._control_readable()
         assert periods(world) == 1
         world.close()

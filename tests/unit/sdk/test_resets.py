@@ -30,7 +30,7 @@ def world() -> Iterator[World]:
 
 def _stop(world: World) -> int:
     """Stop the axis by an order of the daemon; return when it was done [ns]."""
-    world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets)
+    world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets, CLOCK())
     world.runtime.heed()
     return time.monotonic_ns()
 

@@ -38,6 +38,8 @@ def test_a_request_takes_its_right(request_: Request) -> None:
             block=MagicMock(),
             channels=np.array([0]),
             bit=0,
+            number=1,
+            passed_on=False,
         )
         runtime: Any = MagicMock()
         try:

@@ -83,8 +83,7 @@ class Sender:
 
 def _order(world: World, verb: DriverVerb, channels: list[int], bit: int = -1) -> None:
     CLOCK.now_ns += LATER_NS
-    more = [CLOCK()] if verb is DriverVerb.NODE_RESET else []
-    world.order(verb, 0, channels, bit, "eva", world.latch.resets, *more)
+    world.order(verb, 0, channels, bit, "eva", world.latch.resets, CLOCK())
 
 
 def _stop_and_reset(world: World, channels: list[int], bit: int = -1) -> None:
@@ -136,6 +135,36 @@ def test_what_a_client_sends_behind_its_own_reset_is_taken(axes: World) -> None:
     eva.reset()
     assert eva.served() == [None]
     assert owner.served()[2:] == [errno.ECANCELED]
+
+
+def test_a_reset_that_was_sent_before_a_stop_leaves_it(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    _order(axes, DriverVerb.NODE_STOP, [0])
+    axes.runtime.heed()
+    owner.reset()
+    _order(axes, DriverVerb.NODE_STOP, [0])  # somebody asks for it again, and that is acknowledged
+    owner.jog(0)
+    assert owner.served() == [errno.EAGAIN, errno.EPERM]
+    owner.reset()
+    owner.jog(0)
+    assert owner.served()[2:] == [None, None]
+
+
+def test_an_output_that_was_stopped_after_its_reset_had_been_sent_stays_so(port: World) -> None:
+    owner = Sender(port, port.open(0, [0], exclusive=True))
+    owner.reset()
+    _order(port, DriverVerb.NODE_STOP, [0], bit=3)
+    owner.set_bits(0b1000, 0b1000)
+    assert owner.served() == [errno.EAGAIN, errno.EPERM]
+
+
+def test_two_resets_at_once_are_both_done(axes: World) -> None:
+    owner, eva = (Sender(axes, axes.open(0, channels, exclusive=len(channels) > 1)) for channels in ([0, 1], [0]))
+    _order(axes, DriverVerb.NODE_STOP, [0, 1])
+    owner.reset()
+    eva.reset()
+    assert eva.served() == [None] and owner.served() == [None]
+    assert not any(axes.runtime.blocks[0].bank.is_latched(axis) for axis in (0, 1))  # type: ignore[attr-defined]
 
 
 def test_own_resets_hide_no_later_ones_of_others(axes: World) -> None:
@@ -307,7 +336,7 @@ def test_a_write_that_waits_for_the_line_does_not_come_behind_the_stop_of_its_ou
     for sender in (same, beside):
         sender.set_bits(1, 0)
         assert sender.served() == [], "they wait for the line"
-    line.order(DriverVerb.NODE_STOP, block, [0], 1, "eva", line.latch.resets)
+    line.order(DriverVerb.NODE_STOP, block, [0], 1, "eva", line.latch.resets, CLOCK())
     line.runtime.heed()
     for _ in range(200):
         line.turn(calm=True)

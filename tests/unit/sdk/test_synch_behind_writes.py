@@ -121,7 +121,7 @@ def test_what_ends_the_write_ends_the_synch_behind_it(world: World, end: str) ->
     if end == "stop":
         owner.ask(Request.STOP)
     elif end == "emergency":
-        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets)
+        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets, CLOCK())
     elif end == "flush":
         owner.ask(Request.FLUSH)
     else:
@@ -146,7 +146,7 @@ def test_no_instant_is_told_as_seen_at_which_a_stop_had_been_ordered(world: Worl
 
     def order() -> None:
         CLOCK.intrude = None
-        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets)
+        world.order(DriverVerb.NODE_STOP, 0, [0], -1, "eva", world.latch.resets, CLOCK())
         ordered.append(CLOCK())
 
     world.tick()

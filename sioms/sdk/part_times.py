@@ -1,4 +1,4 @@
-"""When what was stopped was reset, to tell requests that were sent before that: they are not carried out after it.
+"""When parts of a device were stopped, and when they were reset: what was sent before that is not carried out after it.
 
 See docs/decisions/0950-what-was-sent-before-a-reset-is-not-taken-after-it.md.
 
@@ -17,11 +17,11 @@ Masks = Mapping[int, int]
 """Channels, and which bits of each; -1: all."""
 
 
-class ResetTimes:
-    """Times of resets, of the whole device and of parts of it.
+class PartTimes:
+    """Times of stops or of resets, of the whole device and of parts of it.
 
     Attributes:
-        count: how many resets have been seen.
+        count: how many have been noted.
     """
 
     def __init__(self) -> None:
@@ -30,15 +30,15 @@ class ResetTimes:
         self._parts: dict[int, dict[Part, tuple[int, int]]] = {}
 
     def note_all(self, at_ns: int) -> None:
-        """Note a reset of the whole device [ns, CLOCK_MONOTONIC]."""
+        """Note one of the whole device [ns, CLOCK_MONOTONIC]."""
         self.count += 1
         self._whole_ns = max(self._whole_ns, at_ns)
 
     def note(self, block: AnyBlock, parts: Iterable[Part], at_ns: int, by: int = 0) -> None:
-        """Note a reset of parts of a block.
+        """Note one of parts of a block.
 
         Args:
-            block, parts: what was stopped and is not any more.
+            block, parts: which.
             at_ns: when that was asked for [ns, CLOCK_MONOTONIC].
             by: number of the handle that asked for it; 0: none.
         """
@@ -48,9 +48,9 @@ class ResetTimes:
             times[part] = max(times.get(part, (0, 0)), (at_ns, by))
 
     def latest_ns(self, block: AnyBlock, masks: Masks, asker: int) -> int:
-        """Return when one of these parts of a block was last reset by another than a handle [ns]; 0: never.
+        """Return the latest time for one of these parts of a block that is not a handle's own [ns]; 0: there is none.
 
-        What a handle says after it has reset something itself was sent after that, and after all resets before.
+        What a handle says after it has stopped or reset something itself was sent after that, and after all before.
         """
         latest_ns = self._whole_ns
         for (channel, bit), (at_ns, by) in self._parts.get(id(block), {}).items():
