@@ -16,7 +16,6 @@ from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solveh_banded
 
 Array = NDArray[np.float64]
 
@@ -269,13 +268,41 @@ def _mesh(layer: Layer, radii: Array, gauge_m: float) -> Array:
     force[-2, 0] = force[-1, 1] = layer.outer_m
     look = _gauge(nodes, radii, gauge_m)
     out = np.empty((4 + 2 * radii.size, _MESHED + 1))
-    for k in range(_MESHED + 1):
-        found = np.zeros((2 * size, 2))
-        found[2:] = solveh_banded(bands[0] + k * bands[1] + k * k * bands[2], force)
-        u, v = found[::2], found[1::2]
-        out[:4, k] = u[-1, 0], u[-1, 1], v[-1, 0], v[-1, 1]
-        out[4:, k] = (look @ u).T.ravel()
+    k = np.arange(_MESHED + 1.0)[:, None, None]
+    found = np.zeros((_MESHED + 1, 2 * size, 2))
+    found[:, 2:] = solve_banded(bands[0] + k * bands[1] + k * k * bands[2], force)
+    u, v = found[:, ::2], found[:, 1::2]
+    out[:4] = u[:, -1, 0], u[:, -1, 1], v[:, -1, 0], v[:, -1, 1]
+    out[4:] = np.moveaxis(look @ u, 0, -1).swapaxes(0, 1).reshape(2 * radii.size, _MESHED + 1)
     return out
+
+
+def solve_banded(bands: Array, right: Array) -> Array:
+    """Return the solutions of several symmetric positive definite systems of the same size and width, shape (m, n, r).
+
+    By L D L^T, all systems at once (Golub and Van Loan, Matrix Computations, 4.3.6). ``scipy.linalg`` has the like for
+    one system; its import takes longer, and 20 MB in every driver.
+
+    Args:
+        bands: the diagonals, the outermost first, shape (m, width + 1, n): [:, width - a, j] is row j - a of column j.
+        right: right-hand sides, shape (n, r), the same for all.
+    """
+    count, rows, n = bands.shape
+    width = rows - 1
+    low = np.zeros((rows, n + width, count))  # [a, i] is row i + a of column i, behind the end 0
+    for a in range(rows):
+        low[a, : n - a] = bands[:, width - a, a:].T
+    x = np.zeros((n + width, right.shape[1], count))
+    x[:n] = right[:, :, None]
+    for i in range(n):
+        column = low[1:, i].copy()
+        low[1:, i] /= low[0, i]
+        for a in range(1, rows):
+            low[: rows - a, i + a] -= low[a, i] * column[a - 1 :]
+        x[i + 1 : i + rows] -= low[1:, i, None] * x[i]
+    for i in reversed(range(n)):
+        x[i] = x[i] / low[0, i] - (low[1:, i, None] * x[i + 1 : i + rows]).sum(axis=0)
+    return np.ascontiguousarray(np.moveaxis(x[:n], -1, 0))
 
 
 def _gauge(nodes: Array, radii: Array, gauge_m: float) -> Array:

@@ -1,12 +1,15 @@
 """The simulated finger against facts that do not use its mesh: published answers, balance, symmetry, limits."""
 
 import math
+import subprocess
+import sys
 
 import numpy as np
 import pytest
+from scipy.linalg import solveh_banded
 
 from sioms.plant.finger import FingerShape, TactileArray
-from sioms.plant.rubber import POINTS, Layer, Rubber, gap
+from sioms.plant.rubber import POINTS, Layer, Rubber, gap, solve_banded
 
 B = Layer()
 ANGLE = 2 * math.pi / POINTS * np.arange(POINTS)
@@ -148,3 +151,22 @@ def test_elements_equally_deep_share_a_pattern(perfect):
     for load, angle in ((5.0, 1.29), (300.0, elements[3])):
         one, each = (array.strain(load, angle, 6e-3) for array in (perfect, deeper))
         np.testing.assert_allclose(one, each, atol=1e-5 * np.abs(one).max())
+
+
+def test_banded_systems_are_solved_as_one_by_one():
+    chance = np.random.default_rng(1)
+    bands = 0.3 * chance.normal(size=(7, 6, 40))
+    bands[:, 5] += 6.0
+    right = chance.normal(size=(40, 2))
+    solved = solve_banded(bands, right)
+    assert solved.shape == (7, 40, 2)
+    for one, found in zip(bands, solved, strict=True):
+        np.testing.assert_allclose(found, solveh_banded(one, right), rtol=1e-12, atol=1e-13)
+
+
+def test_a_simulated_finger_without_an_estimator_loads_no_scipy():
+    code = (
+        "import sys; from sioms.sdk.finding import find_driver; find_driver('sim-tactile', ''); "
+        "sys.exit(any(name.startswith('scipy') for name in sys.modules))"
+    )
+    assert subprocess.run([sys.executable, "-P", "-c", code]).returncode == 0
