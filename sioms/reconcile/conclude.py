@@ -15,8 +15,9 @@ from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.controlled import foreign
 from sioms.reconcile.disturbance import disturbance
-from sioms.reconcile.effect import Array
-from sioms.reconcile.effects.smooth import CONSTANT, LAWS
+from sioms.reconcile.effect import Array, Over
+from sioms.reconcile.effects import known
+from sioms.reconcile.effects.smooth import CONSTANT, LAWS, SIDE
 from sioms.reconcile.engine.evidence import alternative, outcome
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
@@ -38,7 +39,18 @@ from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.simulate import replay
-from sioms.reconcile.thresholds import AXIS, BURSTS, CHANCE, LARGE, MISSED, MOSTLY, QUIET, REFUTED, UNEXPLAINED
+from sioms.reconcile.thresholds import (
+    AXIS,
+    BURSTS,
+    CHANCE,
+    LARGE,
+    MISSED,
+    MOSTLY,
+    PLACES_A_PERIOD,
+    QUIET,
+    REFUTED,
+    UNEXPLAINED,
+)
 from sioms.reconcile.timed import as_recorded
 from sioms.reconcile.variation import named as varied
 from sioms.reconcile.verdict import Candidate, Gap, NamedEffect, Outcome, Place
@@ -90,7 +102,10 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
     spans = spans_of(whole, fit, others_as_deep)
-    named, terms = formulas(*describe(ready.findings, fit, found, s.searcher, others, spans, rng))
+    places = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
+    travel = max(high for _, high in places) - min(low for low, _ in places)
+    told = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
+    named, terms = formulas(*told, travel / nominal.pitch)
     terms += [force.term for force in ready.timed]
     open_rivals = [r for r in others if r.open]
     ratio = found.fit.ratio
@@ -158,10 +173,15 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     )
 
 
-def formulas(named: Sequence[NamedEffect], terms: Sequence[NamedEffect]) -> tuple[list[NamedEffect], list[NamedEffect]]:
+def formulas(
+    named: Sequence[NamedEffect], terms: Sequence[NamedEffect], pitches: float = 0.0
+) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Take its name from an effect beside which a nameless term of the same variable stands: together they are one law
     of that variable, of which nobody can tell how much the effect is; so are a constant and a law without a zero of its
-    own.
+    own, and a force that repeats along the travel, but so seldom that a law could be what makes it.
+
+    Args:
+        pitches: travel of the records.
 
     Returns:
         What is named, and the formulas without a name.
@@ -169,8 +189,17 @@ def formulas(named: Sequence[NamedEffect], terms: Sequence[NamedEffect]) -> tupl
     beside = {t.name for t in terms}
     laws = [law for law in LAWS if beside & {law.name, *law.replaces}]
     within = {n for law in laws for n in (*law.replaces, CONSTANT.get(law.name, ""))}
+    if any(law.over is Over.PLACE for law in laws):
+        within |= {e.name for e in named if _seldom(e, pitches)}
     parts = [replace(e, title=e.equation) for e in named if e.name in within]
     return [e for e in named if e.name not in within], [*terms, *parts]
+
+
+def _seldom(effect: NamedEffect, pitches: float) -> bool:
+    """Say whether a force repeats along the travel, but with a period no shorter than what a smooth law shows."""
+    orders = [q.symbol for q in known()[effect.name].parameters if q.fixed and q.unit == "1/pitch"]
+    periods = [pitches * value.value for value in effect.parameters if value.symbol in orders]
+    return bool(periods) and 2.0 * SIDE / max(periods[0], 1e-300) >= PLACES_A_PERIOD
 
 
 def refused(

@@ -209,6 +209,8 @@ class Effect(AnyEffect):
         mechanism: what it is beside, or instead of, that.
         trials: how it is screened; None for one that is linear in a function of the state.
         sized: the first parameter says how large the effect is.
+        by_reach: its typical size is the start's share of the rated force at the farthest place of the records: no
+            other length of the axis tells it.
         rotary, linear: kinds of axis on which it makes sense.
         joins: effects of which this one is both at once: it is tried where one of them is in the model already.
         beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
@@ -225,6 +227,7 @@ class Effect(AnyEffect):
     trials: Trials | None = None
     over: Over | None = None
     sized: bool = True
+    by_reach: bool = False
     rotary: bool = True
     linear: bool = True
     joins: tuple[str, ...] = ()

@@ -74,7 +74,11 @@ def _trace(problem: Problem, model: AxisModel, effect: Effect) -> Array | None:
         shape = next(shapes(effect, model, range_of(motions)), None)
         if shape is None:  # the range holds no period of any order
             return None
-        parts = [problem.answer(model, size * state_columns(effect, model, m, shape, dead)) for m in motions]
+        forces = [state_columns(effect, model, m, shape, dead) for m in motions]
+        if effect.by_reach:
+            largest = max(float(np.max(np.abs(f))) for f in forces)
+            size = effect.primary.start * model.rated_force / max(largest, 1e-300)
+        parts = [problem.answer(model, size * f) for f in forces]
         trace = problem.join(parts) / problem.noise.innovation
     else:
         values = next(iter(trial_values(effect, model, problem)))

@@ -4,17 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sioms.reconcile.effect import Ref
+import numpy as np
+
+from sioms.reconcile.effect import Array, Effect, Over, Ref
 from sioms.reconcile.effects import known
+from sioms.reconcile.effects.smooth import CENTRE, SIDE, STEP
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.thresholds import NEARLY
+from sioms.reconcile.thresholds import FORMULA, NEARLY
 from sioms.reconcile.variation import named
 
 
 def plainer(name: str, names: Sequence[str]) -> list[str]:
     """List the look-alikes with fewer parameters."""
     return [o for o in known()[name].lookalikes if o in names and size(o) < size(name)]
+
+
+def formulas_of(model: AxisModel, law: str, names: Sequence[str]) -> list[tuple[AxisModel, str]]:
+    """Return the model with each formula of one number in the place of a smooth law that has its course, the nearest
+    first, and the formula's name.
+    """
+    effect = known()[law]
+    if effect.over is None:
+        return []
+    row = effect.row(effect.values(model.effects[law]), model.pitch)
+    at = row[CENTRE] + row[STEP] * np.linspace(-SIDE, SIDE, 8 * SIDE + 1)
+    curve, found = _over(effect, effect.over, at, row), []
+    for other in (o for o in effect.replaces if o in names and size(o) == 1 and vacant(model, law, o)):
+        one = known()[other]
+        if one.slot is not effect.slot:
+            continue
+        # the constant of a law is the offset's
+        columns = np.column_stack([_over(one, effect.over, at, one.row(np.ones(1), model.pitch)), np.ones_like(at)])
+        number, constant = np.linalg.lstsq(columns, curve, rcond=1e-12)[0]
+        left = float(np.sum((curve - columns @ (number, constant)) ** 2) / max(np.sum(curve**2), 1e-300))
+        p = one.primary
+        inside = p.lower * model.scale(p) <= number <= p.upper * model.scale(p)
+        if left < FORMULA and inside:
+            found.append((left, named(model.without_effect(law).with_effect(other, {p.symbol: float(number)})), other))
+    return [(swap, other) for _, swap, other in sorted(found, key=lambda f: f[0])]
+
+
+def _over(effect: Effect, over: Over, at: Array, row: Array) -> Array:
+    """Return what the state function of an effect gives over one variable, at unit speed where that is the place."""
+    x, v, u = (at if name == over.value else np.zeros_like(at) for name in "xvu")
+    return effect.evaluate(x, v + 1.0 if over is Over.PLACE else v, u, np.zeros_like(at), row)
 
 
 def swapped(model: AxisModel, name: str, other: str) -> AxisModel:

@@ -20,6 +20,7 @@ from sioms.reconcile.engine.search import AND, Added, Saving, Search, Start, Tri
 from sioms.reconcile.fit import Fit, Problem, block_ids, closed_errors, refit, shifted
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import (
+    formulas_of,
     physical,
     plainer,
     replaced,
@@ -389,7 +390,11 @@ class Searcher(Search[AxisModel]):
         return small(fit.model, name)
 
     def simpler(self, fit: Fit, name: str) -> Iterator[tuple[str, str, Fit]]:
-        """Yield look-alikes of fewer parameters in the place of an effect."""
+        """Yield look-alikes of fewer parameters in the place of an effect, and formulas in that of a law that is one of
+        them.
+        """
+        for model, other in formulas_of(fit.model, name, self.names):
+            yield name, other, self.fit(model, 6)
         for other in plainer(name, self.names):
             if vacant(fit.model, name, other):
                 yield name, other, self.fit(swapped(fit.model, name, other), 6)

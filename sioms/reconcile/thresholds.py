@@ -182,6 +182,15 @@ them, where a free run then leaves less than this share. A joint of an arm: 43 w
 FELL = 0.7
 """The noise is taken again from what a search leaves when it fell below this share, and the search repeated."""
 
+FORMULA = 0.05
+"""A smooth law has the course of a formula of one number where that leaves less than this share of its squares over
+its places; whether the formula does as well is then judged on held-out blocks. Straight laws of viscous friction leave
+1e-4, a law through a drag with the square of the speed 0.06 of a straight line (0970)."""
+PLACES_A_PERIOD = 1.0
+"""Beside a nameless term of the place a periodic force keeps its name where a period is shorter than this many places
+of a smooth law over the same travel, an eighth of it: what is longer, a law can be made of. Cogging that took two
+periods a turn of a detent, on two turns: two places; true cogging of 14 periods a turn there 0.3 (0970)."""
+
 # --- what keeps time
 
 HALVED, ROUGHLY, ABOUT = 0.5, 2.0, 1.25

@@ -37,6 +37,8 @@ HARDENING_SPRING = Effect(
     signature="force residual with the cube of position",
     lookalikes=("spring", "gravity", "asymmetric_spring"),
     separate="the whole range, slowly, both ways, and swings of several sizes",
+    sized=False,
+    by_reach=True,
 )
 ASYMMETRIC_SPRING = Effect(
     name="asymmetric_spring",

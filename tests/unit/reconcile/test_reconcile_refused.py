@@ -19,7 +19,7 @@ from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Session
 from sioms.reconcile.report.page import page
 from sioms.reconcile.report.words import as_json, summary
-from sioms.reconcile.verdict import Candidate, NamedEffect, Outcome
+from sioms.reconcile.verdict import Candidate, Estimate, NamedEffect, Outcome
 
 AXES = Path(__file__).parents[2] / "physics" / "reconcile_axes"
 WEAK = Candidate("stribeck", "Stribeck friction (low-speed drop)", REFUSED_FREE)
@@ -74,6 +74,21 @@ def test_a_constant_beside_a_nameless_law_has_no_name() -> None:
         ("term_falling_drag", ["offset", "payload"]),
     ):
         assert [e.name for e in formulas(named, [effect(term)])[0]] == left, term
+
+
+def periodic(name: str, periods: float) -> NamedEffect:
+    return replace(effect(name), parameters=(Estimate("n", periods, periods, periods, "1/pitch", ""),))
+
+
+@pytest.mark.parametrize("name", ["cogging", "torque_ripple", "friction_variation", "coulomb_position"])
+@pytest.mark.parametrize("term", ["term_law_of_place", "term_wave", "term_stop_above"])
+def test_what_repeats_too_seldom_has_no_name_beside_a_nameless_force_of_the_place(name: str, term: str) -> None:
+    """On two turns a force of two periods a turn may be a part of what bends once; one of fourteen may not."""
+    seldom, often = periodic(name, 2.0), periodic(name, 14.0)
+    assert formulas([seldom], [effect(term)], 2.0)[0] == []
+    assert formulas([often], [effect(term)], 2.0)[0] == [often]
+    assert formulas([seldom], [effect("term_law_of_speed")], 2.0)[0] == [seldom]
+    assert formulas([seldom], [], 2.0)[0] == [seldom]
 
 
 @cache
