@@ -15,6 +15,8 @@ from sioms.arguments import positive
 if TYPE_CHECKING:
     from sioms.reconcile.live.watch import Watched
 
+#: State of axes of a running cell. A recording has none unless it is given: its axes may have the same names.
+STATE = Path("watch.json")
 #: Exit status: nothing has drifted; something has, with a name; its cause is open.
 NORMAL, NAMED, OPEN_CAUSE = 0, 3, 4
 
@@ -35,7 +37,9 @@ def add_parser(kinds: Any) -> None:
         help="node of one bit that changes at a fixed position of the axis's load, such as a light beam",
     )  # fmt: skip
     one.add_argument("--learn", type=positive, default=2.0, metavar="H", help="length of commissioning [h] (2)")
-    one.add_argument("--state", type=Path, default=Path("watch.json"), metavar="FILE", help="state file (watch.json)")
+    one.add_argument(
+        "--state", type=Path, metavar="FILE", help="state file (watch.json; of a recording none unless given)"
+    )
     one.add_argument("--relearn", action="store_true", help="learn the named axes again from now on")
     one.add_argument("--time", type=positive, metavar="S", help="stop after this time [s]")
     one.add_argument(
@@ -124,7 +128,7 @@ def _beside(args: argparse.Namespace, say: Callable[[str], None]) -> int:
     until_s = time.monotonic() + (args.time or float("inf"))
     beside = Beside(
         lambda: sioms.Workcell(args.socket, "reconcile watch"), args.nodes, _maker(args), say,
-        lambda axis: _write(args, beside.axes, beside.offset_s), args.state, args.relearn,
+        lambda axis: _write(args, beside.axes, beside.offset_s), args.state or STATE, args.relearn,
     )  # fmt: skip
     try:
         beside.open()
@@ -166,7 +170,7 @@ def _propose(args: argparse.Namespace, say: Callable[[str], None]) -> int:
     from sioms.reconcile.watch.propose import corrected
     from sioms.whole_file import write_whole
 
-    axes = kept_axes(args.state, args.nodes, _models(args))
+    axes = kept_axes(args.state or STATE, args.nodes, _models(args))
     args.out.mkdir(parents=True, exist_ok=True)
     for name, axis in axes.items():
         if axis.watch.normal is None:
