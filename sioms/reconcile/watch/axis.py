@@ -26,6 +26,9 @@ WINDOWS = (3, 6, 12, 24)
 AGREE, OPEN, OVER = 3, 9, 12
 #: An edge of the reference counts where the commanded speed was the same for so long [s], within this share of it.
 STEADY_S, STEADY = 0.03, 0.02
+#: ... or where it was changed all the same way, by this share of the axis's speed at least: then inertia says which
+#: flank of a play bears.
+PUSHED_S, PUSHED = 0.04, 0.1
 #: Blocks that are kept.
 KEPT = 400
 #: A drift is serious from this share of the usual force on, or where a place or a play changes by this share of the
@@ -167,7 +170,7 @@ class AxisWatch:
         for at in [e for e in self._edges if e <= last]:
             i = int(np.searchsorted(samples.time_s, at))
             if 0 < i < len(samples) and samples.time_s[i] - samples.time_s[i - 1] < 1.5 * self.about.tick_s:
-                way = float(np.sign(samples.speed[i])) if self._is_steady(samples, i) else 0.0
+                way = float(np.sign(samples.speed[i])) if self._is_steady(samples, i) else 2.0 * self._push(samples, i)
                 place = float(np.interp(at, samples.time_s[i - 1 : i + 1], samples.position[i - 1 : i + 1]))
                 if way:
                     self._collector.cross(Crossing(place, int(way)))
@@ -178,6 +181,16 @@ class AxisWatch:
         before = max(i - round(STEADY_S / self.about.tick_s), 0)
         speed = samples.speed[before : i + 1]
         return bool(np.ptp(speed) <= STEADY * abs(float(speed[-1])))
+
+    def _push(self, samples: Samples, i: int) -> float:
+        """Return the way in which the axis has been accelerated clearly for a while; 0 where it has not."""
+        before = i - max(round(PUSHED_S / self.about.tick_s), 1)
+        if before < 0:
+            return 0.0
+        steps = np.diff(samples.speed[before : i + 1])
+        gained = float(np.sum(steps))
+        one_way = bool(np.all(steps * np.sign(gained) > 0.0))
+        return float(np.sign(gained)) if one_way and abs(gained) > PUSHED * self.about.speed else 0.0
 
     def _take(self, block: Block) -> None:
         self.blocks.append(block)

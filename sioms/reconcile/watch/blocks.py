@@ -24,7 +24,11 @@ TOLD = 1e4
 
 @dataclass(frozen=True, slots=True)
 class Crossing:
-    """The edge of a reference, as the axis reads its place: [m or rad]; ``way`` -1 or 1."""
+    """The edge of a reference, as the axis reads its place: [m or rad].
+
+    ``way``: -1 or 1, the way of the motion, at a steady speed; -2 or 2 where the axis accelerates that way, so that a
+    load behind a play is pushed that way.
+    """
 
     place: float
     way: int

@@ -27,6 +27,13 @@ BENT = 0.05
 #: A play of at least this share of the smallest that has a column is seen, if at least this share of the mass is behind
 #: it.
 SMALLEST, BEHIND = 0.5, 0.15
+#: Edges that inertia moves apart are those of a play that makes their shift where that is twice the shift, but for this
+#: share, and where it is so many times its error; below that share it is none.
+TURNED = 0.4, 5.0
+#: Share of the mass that is behind a play at least, for inertia to bring its other flank to bear.
+INERT = 0.4
+#: Of a play of which one flank bears, twice the shift is the size to within this share.
+ONE_WAY = 0.1
 #: A reference tells a play whose standard deviation is such a share of it.
 TOLD_PLAY = 0.2
 #: What orders an unexplained change.
@@ -95,6 +102,8 @@ CAUSES = (
     Cause("drive lag", "the drive is later", "{m} s", _axis(LAG), 0, "backlash"),
 )  # fmt: skip
 BY_NAME = {cause.name: cause for cause in CAUSES}
+#: Where a constant force holds the load at one flank, play shifts the reference, too.
+ONE_FLANK = Cause("backlash", BY_NAME["backlash"].text, "{x}", _axis(GAP, GAP + 1, GAP + 2, PLAY, LAG, GIVE, PLACE))
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,8 +151,15 @@ def judge(normal: Normal, now: Estimate, travel: float) -> Finding:
     slack[[PLACE, PLAY], [PLACE, PLAY]] += (BENT * places) ** 2
     slack[SCALE, SCALE] += (BENT * places / travel) ** 2
     loose = {cause.name: _fit(cause, normal.theta, change, slack) for cause in CAUSES}
-    names = _names({name: left for name, (left, *_) in loose.items()})
-    if names == ("place",) and not _without_play(normal, now, change, travel):
+    lefts = {name: left for name, (left, *_) in loose.items()}
+    names = _names(lefts)
+    one = _fit(ONE_FLANK, normal.theta, change, slack)
+    others = [left for name, left in lefts.items() if name != ONE_FLANK.name]
+    if one[0] < LEFT and min(others) > one[0] + RIVAL and _behind(normal, now, change, travel)[0]:
+        names, loose[ONE_FLANK.name] = (ONE_FLANK.name,), one
+    if "place" in names:
+        names = _by_turns(names, normal, now, float(change[PLACE]))
+    if names == ("place",) and not (_never_turned(normal, now, change) or _without_play(normal, now, change, travel)):
         names = (*names, "backlash")
     scores = change**2 / np.diag(cover)
     ordered = ORDERED[ALL_NAMES[int(np.argmax(scores))]]
@@ -162,6 +178,30 @@ def _without_loads(normal: Normal, change: Array, cover: Array) -> tuple[Array, 
     return change, cover
 
 
+def _by_turns(names: tuple[str, ...], normal: Normal, now: Estimate, place: float) -> tuple[str, ...]:
+    """Name a shift of the reference backlash where edges moved apart by twice of it between one push and the other.
+
+    A play of which one flank bears at steady speed shifts the edges there by half of it; inertia brings the other flank
+    to bear.
+    """
+    play, error = now.turned[0] - normal.turned, now.turned[1]
+    twice = 2.0 * abs(place)
+    if np.isfinite(play) and TURNED[1] * error < play and abs(play - twice) < TURNED[0] * twice + 2.0 * error:
+        return ("backlash",)
+    return names
+
+
+def _never_turned(normal: Normal, now: Estimate, change: Array) -> bool:
+    """Say whether edges are passed at the same place whichever way inertia pushes the load, where a play that makes the
+    shift would have moved them apart by twice of it.
+
+    Only where inertia outweighs the constant force on the axis: else the load may never leave its flank.
+    """
+    play, error = abs(now.turned[0] - normal.turned), now.turned[1]
+    outweighs = INERT * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > abs(float(normal.theta[CONSTANT]))
+    return bool(outweighs and play + 2.0 * error < TURNED[0] * 2.0 * abs(float(change[PLACE])))
+
+
 def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -> bool:
     """Say whether a shift of the reference's edges cannot be play, which shifts them by the flank that bears.
 
@@ -170,18 +210,25 @@ def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -
     there on is tried by itself: of all sizes at once only their sum shows, and what is too small to show in it hides
     the rest. What is too small for any column is not told apart.
     """
+    return _behind(normal, now, change, travel)[1]
+
+
+def _behind(normal: Normal, now: Estimate, change: Array, travel: float) -> tuple[bool, bool]:
+    """Say whether reversals of force prove a mass behind the play that a shift of the reference would be, and whether
+    they exclude one behind any play from there on.
+    """
     gap = 2.0 * abs(float(change[PLACE])) / travel
     if gap <= SMALLEST * PLAYS[0]:
-        return False
+        return False, False
     plays = slice(GAP, GAP + len(PLAYS))
     information = np.linalg.inv((now.noise + normal.own)[plays, plays])
     least = BEHIND * abs(float(normal.theta[MASS]))
+    spans = []
     for way in _sizes(gap):
         known = float(way @ information @ way)
-        behind = float(way @ information @ change[plays]) / known
-        if behind + 2.0 / np.sqrt(known) >= least:
-            return False
-    return True
+        behind, error = float(way @ information @ change[plays]) / known, 2.0 / np.sqrt(known)
+        spans.append((behind - error, behind + error))
+    return spans[0][0] > least, all(high < least for _, high in spans)
 
 
 def _sizes(gap: float) -> list[Array]:
@@ -233,6 +280,10 @@ def _size(
     if cause.name != "backlash":
         return float(along[0]), half
     play, known = now.theta[PLAY] - normal.theta[PLAY], now.noise[PLAY, PLAY]
+    shift, unsure = 2.0 * abs(float(now.theta[PLACE] - normal.theta[PLACE])), now.noise[PLACE, PLACE]
+    unsure = 2.0 * float(np.sqrt(unsure + normal.own[PLACE, PLACE]))
+    if shift > abs(play) and unsure < TOLD_PLAY * shift:  # one flank bears: hardly ever the other does at steady speed
+        return shift, 1.96 * unsure + ONE_WAY * shift
     known = float(np.sqrt(known + normal.own[PLAY, PLAY]))
     if known < TOLD_PLAY * abs(play):
         return float(play), 1.96 * known

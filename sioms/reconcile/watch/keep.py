@@ -100,11 +100,15 @@ def _array(table: Mapping[str, Any], name: str) -> Array:
 
 
 def _block(t: Mapping[str, Any], offset_s: float) -> Block:
-    crossings = tuple(Crossing(_number(p), 1 if w > 0 else -1) for p, w in list(t["crossings"])[:MOST_CROSSINGS])
+    crossings = tuple(Crossing(_number(p), _way(w)) for p, w in list(t["crossings"])[:MOST_CROSSINGS])
     return Block(
         _number(t["start_s"]) - offset_s, _number(t["end_s"]) - offset_s, _number(t["motion_s"]), int(t["rows"]),
         _array(t, "gram"), _array(t, "freed"), _maybe(t["least"]), _maybe(t["most"]), _number(t["error"]), crossings,
     )  # fmt: skip
+
+
+def _way(value: Any) -> int:
+    return int(np.copysign(2 if abs(_number(value)) > 1 else 1, value))
 
 
 def _normal(t: Mapping[str, Any], offset_s: float) -> Normal:
@@ -114,7 +118,7 @@ def _normal(t: Mapping[str, Any], offset_s: float) -> Normal:
     return Normal(
         _array(t, "theta"), own, _number(t["noise"]), _number(t["force"]), per, t["loads"] is True, _number(t["least"]),
         _number(t["most"]), tuple(_number(x) for x in t["edges"]), _number(t["scatter"]), _number(t["error"]),
-        int(t["blocks"]), _number(t["until_s"]) - offset_s,
+        int(t["blocks"]), _number(t["until_s"]) - offset_s, _maybe(t.get("turned")),
     )  # fmt: skip
 
 

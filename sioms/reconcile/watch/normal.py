@@ -45,6 +45,8 @@ UNKNOWN = 1e12
 #: What place and play of a reference, of the travel, and its scale may be at most (one standard deviation): a pulley or
 #: an encoder that is a quarter off does not get into production.
 MOST_PLACE, MOST_SCALE = 0.1, 0.05
+#: Crossings under acceleration that are needed each way.
+FEW_PUSHED = 4
 #: Crossings within this share of the travel are of one edge.
 ONE_EDGE = 0.01
 
@@ -63,6 +65,7 @@ class Normal:
         edges: places of the reference's edges; scatter: of a crossing.
         error: mean square following error.
         blocks: learnt from; until_s: of the axis's clock.
+        turned: play that crossings show in which inertia pushes one way or the other; NaN where none tell it.
     """
 
     theta: Array
@@ -78,6 +81,7 @@ class Normal:
     error: float
     blocks: int
     until_s: float
+    turned: float = np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,7 +89,8 @@ class Estimate:
     """Numbers of some blocks and their covariance, without the axis's own variation.
 
     A number that no move tells has UNKNOWN, one of the reference that no crossing tells the most that it may be.
-    ``left`` is the mean square of force that the model leaves; ``gram`` and ``rows`` are of the blocks.
+    ``left`` is the mean square of force that the model leaves; ``gram`` and ``rows`` are of the blocks. ``turned`` is
+    the play that crossings show in which inertia pushes one way or the other, and its standard deviation.
     """
 
     theta: Array
@@ -93,6 +98,7 @@ class Estimate:
     left: float
     gram: Array
     rows: int
+    turned: tuple[float, float] = (np.nan, np.inf)
 
 
 def estimate(
@@ -130,7 +136,26 @@ def estimate(
     apart = max(_apart(blocks, loads, theta[list(FRICTIONS)]) - row, 0.0)
     cover[np.ix_(FRICTIONS, FRICTIONS)] += apart * inverse[np.ix_(few, few)]
     _refer(blocks, edges, scatter, travel, theta, cover)
-    return Estimate(theta, cover, left, gram, rows)
+    return Estimate(theta, cover, left, gram, rows, _turned(blocks, edges, scatter))
+
+
+def _turned(blocks: Sequence[Block], edges: Sequence[float], scatter: float) -> tuple[float, float]:
+    """Return by how much edges are passed elsewhere while the axis is accelerated one way and the other, and the
+    standard deviation of that.
+
+    Inertia then holds the load at one flank or the other, whatever bears at steady speed; a shift of the reference is
+    the same for both.
+    """
+    pushed = [(c.place, np.sign(c.way)) for b in blocks for c in b.crossings if abs(c.way) == 2]
+    if not edges or not pushed:
+        return np.nan, np.inf
+    places, ways = np.array(pushed, dtype=np.float64).T
+    off = places - np.array(edges)[np.abs(places[:, None] - np.array(edges)).argmin(axis=1)]
+    sides = [off[ways == way] for way in (-1.0, 1.0)]
+    if min(map(len, sides)) < FEW_PUSHED:
+        return np.nan, np.inf
+    spread = max(float(np.sqrt(np.mean(np.concatenate([s - np.mean(s) for s in sides]) ** 2))), scatter)
+    return float(np.mean(sides[1]) - np.mean(sides[0])), spread * float(np.sqrt(sum(1.0 / len(s) for s in sides)))
 
 
 def _apart(blocks: Sequence[Block], loads: bool, together: Array) -> float:
@@ -163,7 +188,8 @@ def _refer(
     """
     most = _most(travel)
     cover[SIZE:, SIZE:] = np.diag(most**2)
-    places = np.array([(c.place, c.way) for b in blocks for c in b.crossings], dtype=np.float64).reshape(-1, 2)
+    steady = [(c.place, c.way) for b in blocks for c in b.crossings if abs(c.way) == 1]
+    places = np.array(steady, dtype=np.float64).reshape(-1, 2)
     if not edges or len(places) < 4:
         return
     marks = np.array(edges)[np.abs(places[:, :1] - np.array(edges)).argmin(axis=1)]
@@ -220,12 +246,13 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     return Normal(
         theta, known + UNSEEN * own + np.diag(floor**2 + unseen * heat**2), noise, force, per, loads, low, high,
         edges, scatter, float(np.mean([b.error for b in blocks])), len(blocks), blocks[-1].end_s,
+        _turned(blocks, edges, scatter)[0],
     )  # fmt: skip
 
 
 def _edges(blocks: Sequence[Block], travel: float, step: float) -> tuple[tuple[float, ...], float]:
     """Return the places of the reference's edges and the scatter of a crossing about its side of an edge."""
-    all_ = sorted((c.place, c.way) for b in blocks for c in b.crossings)
+    all_ = sorted((c.place, c.way) for b in blocks for c in b.crossings if abs(c.way) == 1)
     if len(all_) < 8:
         return (), 0.0
     places, ways = np.array([p for p, _ in all_]), np.array([w for _, w in all_])

@@ -244,6 +244,60 @@ def test_an_edge_counts_where_the_speed_is_steady() -> None:
     assert crossing.place == pytest.approx(float(np.interp(0.6, t, x)), abs=1e-6) and crossing.way == 1
 
 
+def test_an_edge_counts_where_inertia_says_which_flank_bears() -> None:
+    """Speeding up and braking, the load is pushed to and fro; in between a change of speed nothing is said."""
+    watch, n = AxisWatch(ABOUT, Settings()), 1200
+    t = TICK_S * np.arange(n)
+    speed = 0.3 * np.clip(10.0 * np.minimum(t, t[-1] - t), 0.0, 1.0)
+    x = np.cumsum(speed) * TICK_S
+    move = replace(samples(x, np.ones(n)), speed=speed)
+    edges = [0.02, 0.08, 0.11, 0.6, 1.18]
+    watch.feed(move.and_then(samples(np.full(200, x[-1]), np.zeros(200), 1.2, slice(0, 0))), edges)
+    assert [c.way for c in watch._collector.crossings] == [2, 1, -2]
+
+
+def test_a_place_is_told_from_a_play_by_the_edges_under_acceleration() -> None:
+    """A play of which one flank bears shifts an edge by half of it; pushed the other way, the edge is elsewhere."""
+    rng = np.random.default_rng(9)
+    speeds, edges = [0.05, 0.1, 0.2, 0.3], (0.03, 0.08)
+
+    def passed(blocks: list[Block], shift: float, play: float) -> list[Block]:
+        pushed = [Crossing(e + 0.5 * play * np.sign(w), w) for e in edges for w in (-2, 2)]
+        seen = [Crossing(e + shift, w) for e in edges for w in (-1, 1, -1, 1)] + pushed
+        every = [tuple(replace(c, place=c.place + 1e-6 * rng.standard_normal()) for c in seen) for _ in blocks]
+        return [replace(b, crossings=own) for b, own in zip(blocks, every, strict=True)]
+
+    was = learn(passed(blocks_at(rng, speeds * 5, 3.0), 0.0, 4e-5), 0.4, 1e-6)
+    assert was.turned == pytest.approx(4e-5, abs=2e-6), "what yields in normal operation"
+    unsure = replace(was, own=was.own + np.diag(4.0 * (np.arange(TOTAL) // 3 == GAP // 3)))
+    unsure = replace(unsure, theta=unsure.theta * (np.arange(TOTAL) != CONSTANT))
+    heavy = replace(unsure, theta=unsure.theta + 30.0 * np.eye(TOTAL)[CONSTANT])
+    for base, shift, play, names in (
+        (unsure, 3e-4, 4e-5, ("place",)),
+        (unsure, -3e-4, 4e-5, ("place",)),
+        (unsure, 3e-4, 6.4e-4, ("backlash",)),
+        (unsure, 3e-4, 3e-4, ("place", "backlash")),
+        (replace(unsure, turned=np.nan), 3e-4, 4e-5, ("place", "backlash")),
+        (heavy, 3e-4, 4e-5, ("place", "backlash")),
+    ):
+        seen = estimate(passed(blocks_at(rng, speeds, 3.0), shift, play), False, edges, was.scatter, was.noise, 0.4)
+        found = judge(base, replace(seen, theta=seen.theta + base.theta - was.theta), 0.4)
+        assert found.names == names, (shift, play, names, found.names)
+        if names == ("backlash",):
+            assert found.low <= play - 4e-5 <= found.high
+
+
+def test_a_play_of_which_one_flank_bears_is_named_where_reversals_prove_it() -> None:
+    """It shifts the reference by half of it, and a mass behind it goes on by itself when the force turns."""
+    was = normal()
+    for behind, names in ((1.0, ("backlash",)), (0.0, ("place",)), (0.25, ())):
+        found = judge(was, now(place=3e-4, gap1=behind, gap2=0.5 * behind), 0.4)
+        assert found.names == names, (behind, found.names)
+        if names == ("backlash",):
+            assert found.low < 6e-4 < found.high < 8e-4
+    assert judge(was, now(scale=0.01, gap1=1.0), 0.4).names == ()
+
+
 def test_what_is_normal_is_known_no_better_than_its_noise_allows() -> None:
     errors = []
     for seed in range(12):
