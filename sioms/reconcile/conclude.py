@@ -102,8 +102,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
     spans = spans_of(whole, fit, others_as_deep)
-    places = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
-    travel = max(high for _, high in places) - min(low for low, _ in places)
+    ends = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
+    travel = max(high for _, high in ends) - min(low for low, _ in ends)
     told = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
     named, terms = formulas(*told, travel / nominal.pitch)
     terms += [force.term for force in ready.timed]

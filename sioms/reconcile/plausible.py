@@ -29,7 +29,8 @@ def formulas_of(model: AxisModel, law: str, names: Sequence[str]) -> list[tuple[
         return []
     row = effect.row(effect.values(model.effects[law]), model.pitch)
     at = row[CENTRE] + row[STEP] * np.linspace(-SIDE, SIDE, 8 * SIDE + 1)
-    curve, found = _over(effect, effect.over, at, row), []
+    curve = _over(effect, effect.over, at, row)
+    found: list[tuple[float, AxisModel, str]] = []
     for other in (o for o in effect.replaces if o in names and size(o) == 1 and vacant(model, law, o)):
         one = known()[other]
         if one.slot is not effect.slot:

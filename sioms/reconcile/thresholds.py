@@ -184,8 +184,8 @@ FELL = 0.7
 
 FORMULA = 0.05
 """A smooth law has the course of a formula of one number where that leaves less than this share of its squares over
-its places; whether the formula does as well is then judged on held-out blocks. Straight laws of viscous friction leave
-1e-4, a law through a drag with the square of the speed 0.06 of a straight line (0970)."""
+its places; whether the formula does as well is then judged on held-out blocks. The law that viscous friction made
+leaves 1e-5, a drag with the square of the speed 0.06 (0970)."""
 PLACES_A_PERIOD = 1.0
 """Beside a nameless term of the place a periodic force keeps its name where a period is shorter than this many places
 of a smooth law over the same travel, an eighth of it: what is longer, a law can be made of. Cogging that took two
