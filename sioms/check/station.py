@@ -453,10 +453,13 @@ def _wait_still(seen: Any, axis: Axis) -> None:
     """Wait until an axis rests in the place where its device says it is."""
 
     def rests() -> bool:
-        first = last = seen.read()
-        while last.stamp_ns < first.stamp_ns + MOVED_S * 1e9:  # a device may be polled as seldom
-            time.sleep(MOVED_S / 10)
-            last = seen.read()
+        try:
+            first = last = seen.read()
+            while last.stamp_ns < first.stamp_ns + MOVED_S * 1e9:  # a device may be polled as seldom
+                time.sleep(MOVED_S / 10)
+                last = seen.read()
+        except OSError:  # its link is lost once more, as that of a device that the machine holds up, and comes back
+            return False
         return not last.in_motion[0] and abs(last.position[0] - first.position[0]) <= axis.tolerance
 
     if not wait_for(rests, STILL_S):

@@ -5,13 +5,15 @@ from __future__ import annotations
 import errno
 import subprocess
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from sioms.check import check, held_up
 from sioms.check.refusal_trials import _tried
-from sioms.check.station import LONGEST_PERIOD_S, Station, Unanswered, _crash, wait_for
+from sioms.check.rigs import Axis
+from sioms.check.station import LONGEST_PERIOD_S, Station, Unanswered, _crash, _wait_still, wait_for
 from sioms.check.trial import TRIES, Failed, Trial, Verdict, attempt
 
 LOG = r"""time=1 level=info event="device up" device=stage pid=7
@@ -181,3 +183,20 @@ def test_the_kernel_tells_how_long_a_process_waited() -> None:
         assert waits.longest({"sleeper": sleeper.pid}) == "", "asleep is not held up"
         sleeper.kill()
     assert waits.longest({"sleeper": sleeper.pid}) == "" and waits.longest({}) == ""
+
+
+def test_calm_is_waited_for_past_a_link_that_is_lost_once_more() -> None:
+    stamps = iter(range(100))
+
+    class Seen:
+        lost = 2
+
+        def read(self) -> Any:
+            self.lost -= 1
+            if self.lost >= 0:
+                raise OSError(errno.EIO, "the link to its device is lost")
+            return SimpleNamespace(stamp_ns=next(stamps) * 100_000_000, in_motion=(0,), position=(0.0,))
+
+    seen = Seen()
+    _wait_still(seen, Axis("x"))
+    assert seen.lost < -1
