@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from sioms.motion import CommandError
 from sioms.motion.queue import LIMIT_NAMES
-from sioms.protocol.flags import REQUESTS, Request
+from sioms.protocol.flags import OF_SOME_AXES, REQUESTS, Request
 from sioms.protocol.text import shown
 
 from .blocks import AnalogBlock, AxisBlock
@@ -29,8 +29,6 @@ from .writing import Behind, check_link, end_writes
 
 FEW_TICKS = 1000
 """Ticks that statistics are told of when nobody asks for more."""
-OF_SOME_AXES = {Request.WAIT_UNTIL_IDLE, Request.ZERO_DEVICE, Request.STOP, Request.HOME}
-"""Requests whose argument may be indices of axes in the node, one or a list, instead of none for all of them."""
 
 
 def _refuse(errno_: int, text: str) -> OSError:
