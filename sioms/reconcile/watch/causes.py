@@ -30,8 +30,6 @@ SMALLEST, BEHIND = 0.5, 0.15
 #: Edges that inertia moves apart are those of a play that makes their shift where that is twice the shift, but for this
 #: share, and where it is so many times its error; below that share it is none.
 TURNED = 0.4, 5.0
-#: Share of the mass that is behind a play at least, for inertia to bring its other flank to bear.
-INERT = 0.4
 #: Of a play of which one flank bears, twice the shift is the size to within this share.
 ONE_WAY = 0.1
 #: A reference tells a play whose standard deviation is such a share of it.
@@ -198,7 +196,7 @@ def _never_turned(normal: Normal, now: Estimate, change: Array) -> bool:
     Only where inertia outweighs the constant force on the axis: else the load may never leave its flank.
     """
     play, error = abs(now.turned[0] - normal.turned), now.turned[1]
-    outweighs = INERT * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > abs(float(normal.theta[CONSTANT]))
+    outweighs = BEHIND * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > abs(float(normal.theta[CONSTANT]))
     return bool(outweighs and play + 2.0 * error < TURNED[0] * 2.0 * abs(float(change[PLACE])))
 
 
