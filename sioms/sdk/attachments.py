@@ -11,7 +11,7 @@ import socket
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -28,7 +28,7 @@ from sioms.turns import Turns
 
 from .blocks import AnyBlock, AxisBlock
 from .exchange import HookError
-from .handles import LATER, Handle, Quota
+from .handles import LATER, UNKNOWN, Came, Handle, Quota
 from .parts import Service
 from .requests import ioctl
 from .stops import Reason, Stop
@@ -36,22 +36,10 @@ from .timestamps import Timestamps, receive
 from .writing import concerned, take_plain, write
 
 OWNERS, READERS = 0, 1
+NEVER_NS = 2**62
 SHARES = (0.85, 0.125)
 """Of its time, what a driver spends at most on the requests of who owns outputs, and on those of all others."""
 add_decoders(verbs.ON_HANDLE)
-UNKNOWN = -1
-
-
-class Came(NamedTuple):
-    """How a packet came.
-
-    Args:
-        resets: how many resets had been seen when it was sent, at least; UNKNOWN: it may be older.
-        timestamp_ns: of the kernel [ns, CLOCK_REALTIME].
-    """
-
-    resets: int
-    timestamp_ns: int
 
 
 class Attachments:
@@ -181,7 +169,8 @@ class Attachments:
             return
         except OSError:
             packet, timestamp_ns = b"", 0
-        came = Came(UNKNOWN if handle.is_in_doubt else resets, timestamp_ns)
+        latest_ns = handle.heard_ns if handle.passed_on else NEVER_NS
+        came = Came(UNKNOWN if handle.is_in_doubt else resets, timestamp_ns, latest_ns)
         handle.took(len(packet))
         handle.hear(time.monotonic_ns())
 
@@ -245,10 +234,7 @@ class Attachments:
             self.heard(handle, min(message.at_ns, handle.came_ns))
             return
         if isinstance(message, verbs.Part):
-            if self._is_stale(handle, message, came):
-                handle.stale_write = message.write
-            elif message.write != handle.stale_write:
-                _keep_part(handle, message)
+            _keep_part(handle, message, came)
             self._note(handle, packet, 0, "")
             return
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order
@@ -259,7 +245,8 @@ class Attachments:
         try:
             if isinstance(message, verbs.Ioctl) and message.request == Request.RESET:
                 self._refuse_late_reset(handle, message, came)
-            elif _acts(message) and (number == handle.stale_write or self._is_stale(handle, message, came)):
+            elif _acts(message) and self._is_stale(handle, number, message, came):
+                handle.ahead = (0, [])
                 raise OSError(
                     errno.ECANCELED, f"{_what(message)} {handle.node}: sent before the last reset; send it again"
                 )
@@ -274,13 +261,15 @@ class Attachments:
             if not message.query and not (isinstance(message, verbs.Ioctl) and REQUESTS[message.request][2]):
                 self._note(handle, packet, 0, "")
 
-    def _is_stale(self, handle: Handle, message: verbs.Message, came: Came) -> bool:
-        """Return whether what a message is for was stopped, and reset, after it had been sent."""
-        resets = self._service.stops.resets
+    def _is_stale(self, handle: Handle, number: int, message: verbs.Message, came: Came) -> bool:
+        """Return whether what a message is for was stopped, and reset, after its first part had been sent."""
+        resets, ahead = self._service.stops.resets, b""
+        if handle.ahead[1] and handle.ahead[0] == number:
+            came, ahead = handle.ahead_came, b"".join(handle.ahead[1])
         if came.resets == resets.count:
             return False
-        reset_ns = resets.latest_ns(handle.block, concerned(handle, message), handle.number)
-        return self._sent_ns(handle, came) < reset_ns
+        reset_ns = resets.latest_ns(handle.block, concerned(handle, message, ahead), handle.number)
+        return self._sent_ns(came) < reset_ns
 
     def _refuse_late_reset(self, handle: Handle, message: verbs.Message, came: Came) -> None:
         """Refuse a reset of what somebody else has stopped after it had been sent.
@@ -289,15 +278,13 @@ class Attachments:
             OSError: EAGAIN.
         """
         asked_ns = self._service.stops.asked.latest_ns(handle.block, concerned(handle, message), handle.number)
-        if asked_ns and self._sent_ns(handle, came) < asked_ns:
+        if asked_ns and self._sent_ns(came) < asked_ns:
             text = f"{_what(message)} {handle.node}: stopped after this was sent; see why, and reset again"
             raise OSError(errno.EAGAIN, text)
 
-    def _sent_ns(self, handle: Handle, came: Came) -> int:
+    def _sent_ns(self, came: Came) -> int:
         """Return when a packet was sent [ns, CLOCK_MONOTONIC], or before."""
-        sent_ns = self.timestamps.monotonic_ns(came.timestamp_ns)
-        # A gateway has received it before, and has told when it was sent at the earliest.
-        return min(sent_ns, handle.heard_ns) if handle.passed_on else sent_ns
+        return min(self.timestamps.monotonic_ns(came.timestamp_ns), came.latest_ns)
 
     def _note(self, handle: Handle, packet: bytes, errno_: int, why: str) -> None:
         """Note a command, after its answer has been sent: a client does not wait for that."""
@@ -383,7 +370,7 @@ def _what(message: verbs.Message) -> str:
     return f"{Request(message.request).name} on" if isinstance(message, verbs.Ioctl) else "write"
 
 
-def _keep_part(handle: Handle, message: verbs.Part) -> None:
+def _keep_part(handle: Handle, message: verbs.Part, came: Came) -> None:
     """Keep records that come ahead of their write; those of a write that never came are dropped."""
     number, records = message
     if len(records) > MAX_INLINE:
@@ -391,7 +378,7 @@ def _keep_part(handle: Handle, message: verbs.Part) -> None:
     if not handle.writes:
         return  # its write will be refused
     if handle.ahead[0] != number:
-        handle.ahead = (number, [])
+        handle.ahead, handle.ahead_came = (number, []), came
     parts = handle.ahead[1]
     if len(parts) <= MAX_WRITE // MAX_INLINE:  # one more than allowed tells that it is too much
         parts.append(records)

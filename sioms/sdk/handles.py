@@ -44,6 +44,23 @@ class Quota(NamedTuple):
     subscriptions: int
 
 
+class Came(NamedTuple):
+    """How a packet came.
+
+    Args:
+        resets: how many resets had been seen when it was sent, at least; UNKNOWN: it may be older.
+        timestamp_ns: of the kernel [ns, CLOCK_REALTIME].
+        latest_ns: when it was sent at the latest, by what a gateway has told [ns, CLOCK_MONOTONIC].
+    """
+
+    resets: int
+    timestamp_ns: int
+    latest_ns: int
+
+
+UNKNOWN = -1
+
+
 class Writing(Protocol):
     """A write of axis records that is not in the buffers yet, or a request that comes after such writes."""
 
@@ -83,13 +100,13 @@ class Handle:
         every: the client is woken by every n-th publication; 0 = not; -1 = when a binary edge came.
         writing: writes of axis records that are not in the buffers yet, the oldest first.
         ahead: number of a write that is to follow, and the records that have come ahead of it.
+        ahead_came: how the first of these came.
         waits: unanswered requests by message number; each has a way to be ended.
         writes: whether it may write.
         axes: ``channels`` as plain integers.
         halted: whether what it owns has been stopped because it ends.
         queued_bytes: how much of what lay in its socket when a reset was seen lies there still.
         reset_ns: when what it shows was reset last [ns, CLOCK_MONOTONIC].
-        stale_write: number of a write some records of which were sent before a reset.
     """
 
     number: int
@@ -117,10 +134,10 @@ class Handle:
     waits: dict[int, Wait] = field(default_factory=dict)
     writing: list[Writing] = field(default_factory=list)
     ahead: tuple[int, list[bytes]] = (0, [])
+    ahead_came: Came = field(default_factory=lambda: Came(0, 0, 0))
     halted: bool = False
     queued_bytes: int = 0
     reset_ns: int = 0
-    stale_write: int = -1
     writes: bool = field(init=False)
     axes: list[int] = field(init=False)
 
@@ -133,8 +150,6 @@ class Handle:
         was sent.
         """
         self.reset_ns = max(self.reset_ns, at_ns)
-        if self.ahead[1]:
-            self.stale_write, self.ahead = self.ahead[0], (0, [])
         self.queued_bytes = pending_bytes(self.sock)
 
     @property

@@ -92,12 +92,12 @@ def masks_of(handle: Handle, records: NDArray[Any]) -> dict[int, int]:
     return masks
 
 
-def concerned(handle: Handle, message: verbs.Message) -> dict[int, int]:
-    """Return what a message is for, as ``masks_of``."""
-    if isinstance(message, verbs.Write | verbs.Part):
-        dtype = _DTYPE[handle.block.spec.node_class]
-        if not len(message.records) % dtype.itemsize:
-            return masks_of(handle, np.frombuffer(message.records, dtype))
+def concerned(handle: Handle, message: verbs.Message, ahead: bytes = b"") -> dict[int, int]:
+    """Return what a message is for, as ``masks_of``; ``ahead`` are records that have come ahead of it."""
+    if isinstance(message, verbs.Write):
+        dtype, records = _DTYPE[handle.block.spec.node_class], ahead + message.records
+        if not len(records) % dtype.itemsize:
+            return masks_of(handle, np.frombuffer(records, dtype))
     return dict.fromkeys(handle.axes, 1 << handle.bit if handle.bit >= 0 else -1)
 
 

@@ -309,6 +309,19 @@ def test_a_write_that_was_sent_in_part_is_refused_as_a_whole(axes: World, is_rec
     assert owner.served() == [errno.ECANCELED, None]
 
 
+def test_a_write_in_parts_for_what_was_not_stopped_is_taken(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    number, sock = 900, owner.client.channel._sock
+    owner.client.pending[number] = owner.answers.append
+    SENT.note()
+    records = jog(1) * 3
+    sock.send(Part(number, records[:200]).packed(0))  # parts end anywhere
+    axes.runtime.clients._readable(axes.runtime.clients.handles[owner.client.node.handle])
+    _stop_and_reset(axes, [0])
+    sock.send(Write(0, 0.0, records[200:]).packed(number))
+    assert owner.served() == [None]
+
+
 def test_bits_that_were_not_stopped_take_what_was_sent(port: World) -> None:
     owner = Sender(port, port.open(0, [0], exclusive=True))
     owner.set_bits(0b0100, 0b0100)
