@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from .recorder import Channel
 
 _COLOURS = ("#1f6feb", "#d1641f", "#2d8a4e", "#8250df", "#bf3989", "#57606a")
+_LETTER = 0.007
+"""Width of a letter of a title, of that of the picture."""
 
 
 def draw(
@@ -48,9 +50,12 @@ def draw(
     axes[0].set_xlim(0, end_s)
     axes[-1].set_xlabel("time [s]")
     _number_events(axes[0], events, end_s)
+    free_s = [0.0, 0.0]  # from where on a line of titles is free
     for begin_s, title in chapters:
+        line = 0 if begin_s >= free_s[0] else 1
+        free_s[line] = begin_s + len(title) * _LETTER * end_s
         axes[0].annotate(
-            title, (begin_s, 1.16), xycoords=("data", "axes fraction"), fontsize=9, fontweight="bold",
+            title, (begin_s, 1.16 + 0.14 * line), xycoords=("data", "axes fraction"), fontsize=9, fontweight="bold",
             annotation_clip=False,
         )  # fmt: skip
     legend.axis("off")
