@@ -13,7 +13,9 @@ import errno
 import os
 import socket
 import time
+import traceback
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple, Protocol
@@ -24,9 +26,11 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import Access, Right
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import refusal, reply
+from sioms.protocol.text import shown
 
 from .blocks import AnyBlock
 from .effects import Effects
+from .exchange import HookError
 from .timestamps import pending_bytes
 
 LOOKS_A_MS = 16
@@ -179,6 +183,11 @@ class Handle:
         """Tell the client why its handle ends, before the socket closes."""
         self._send(refusal(0, errno_, text))
 
+    def cut(self) -> None:
+        """Cut the connection: its end of file ends the handle, which halts what it owns."""
+        with suppress(OSError):
+            self.sock.shutdown(socket.SHUT_RDWR)
+
     def wake(self) -> None:
         """Make the client's end of the pipe readable."""
         try:
@@ -197,8 +206,7 @@ class Handle:
         try:
             self.sock.send(packet)
         except BlockingIOError:
-            # A client that does not read its answers is as good as dead: what follows is its end of file.
-            self.sock.shutdown(socket.SHUT_RDWR)
+            self.cut()  # a client that does not read its answers is as good as dead
         except OSError:
             return
 
@@ -237,11 +245,15 @@ class Waits:
     Args:
         effects: where the effects of what has waited are noted.
         journal: where refusals are noted.
+        log: writes a line of a level to the daemon's log.
         a_look: how many of each user are looked at after a publication.
     """
 
-    def __init__(self, effects: Effects, journal: JournalWriter, a_look: int = LOOKS_A_MS) -> None:
+    def __init__(
+        self, effects: Effects, journal: JournalWriter, log: Callable[[str, str], None], a_look: int = LOOKS_A_MS
+    ) -> None:  # fmt: skip
         self.a_look = a_look
+        self._log = log
         self._effects = effects
         self._journal = journal
         self._of: dict[int, dict[Wait, None]] = {}
@@ -281,12 +293,12 @@ class Waits:
                 return 0
         return until_ns
 
-    def check(self, now_ns: int, shown: Sequence[AnyBlock]) -> None:
+    def check(self, now_ns: int, published: Sequence[AnyBlock]) -> None:
         """Answer what is ready or late, as far as it is looked at; cheap when nothing waits.
 
         Args:
             now_ns: the time [ns].
-            shown: blocks that have just been published, as they are now.
+            published: blocks that have just been published, as they are now.
         """
         if not self._of:
             return
@@ -299,21 +311,29 @@ class Waits:
                 if is_more:
                     del waiting[wait]
                     waiting[wait] = None  # behind the others
-                self._look(wait, now_ns, shown)
+                self._look(wait, now_ns, published)
             if not waiting:
                 self._of.pop(uid, None)
 
-    def _look(self, wait: Wait, now_ns: int, shown: Sequence[AnyBlock]) -> None:
+    def _look(self, wait: Wait, now_ns: int, published: Sequence[AnyBlock]) -> None:
         try:
             done = wait.ready() if wait.refusal is None else None
         except OSError as error:
             self._refuse(wait, error.errno or errno.EIO, error.strerror or str(error))
             return
+        except HookError:
+            raise  # the driver may have done half of it: it stops its device
+        except Exception as error:  # a mistake of ours costs this handle, as it does where nothing waits
+            trace = "".join(traceback.format_exception(error)[-3:])
+            self._log("error", f"{wait.what}: the driver failed to serve {wait.handle.who}: {trace}")
+            self._refuse(wait, errno.EIO, f"{wait.what}: the driver failed: {shown(error)}")
+            wait.handle.cut()
+            return
         if wait.refusal is not None:
             self._refuse(wait, *wait.refusal)
         elif done is not None:
             self._remove(wait)
-            if not (wait.looks and any(wait.handle.block is block for block in shown)):
+            if not (wait.looks and any(wait.handle.block is block for block in published)):
                 self._effects.note()
             wait.handle.answer(wait.number, done[0])
         elif wait.deadline_ns is not None and now_ns >= wait.deadline_ns:

@@ -22,6 +22,7 @@ from sioms.protocol.text import shown
 
 from .blocks import AnalogBlock, AxisBlock
 from .driver import Awaited, Refusal
+from .exchange import HookError
 from .handles import LATER, Handle, Wait
 from .parts import Service
 from .stops import Reason, Stop
@@ -294,6 +295,8 @@ def _await(service: Service, handle: Handle, number: int, answer: Awaited, timeo
             return answer.ready()
         except Refusal as error:
             raise _refuse(error.errno, f"{what}: {error}") from None
+        except Exception as error:
+            raise HookError(f"what {what} is waited for by") from error
 
     service.waits.add(Wait(handle, number, what, service.loop.deadline(timeout_s), ready))
     return LATER

@@ -82,7 +82,7 @@ class Runtime:
         self.running = True
         self.journal = JournalWriter(memoryview(mmap.mmap(fds[6], HEADER + JOURNAL_SIZE)))
         self.effects = Effects()
-        self.waits = Waits(self.effects, self.journal)
+        self.waits = Waits(self.effects, self.journal, self.log)
         self.looked_ns = 0
         self.outputs = Outputs()
         self.statistics = TickStatistics()

@@ -202,7 +202,7 @@ class Handle:
 
 
 def waits_of(*kinds):
-    waits = Waits(None, None)
+    waits = Waits(None, None, print)
     for number, (deadline_ns, on_events) in enumerate(kinds):
         waits.add(Wait(Handle(), number, "wait", deadline_ns, lambda: None, on_events=on_events))
     return waits
