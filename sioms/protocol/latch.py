@@ -12,6 +12,8 @@ from .text import printable
 LATCH_SIZE = 4096
 _STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS, _RESET_AT, _ENDED = range(8)
 _TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
+_SEPARATE = 576
+"""Words that no steps look at: when the last stop was ended."""
 
 
 class Latch:
@@ -26,6 +28,7 @@ class Latch:
     def __init__(self, buffer: memoryview) -> None:
         self._bytes = buffer
         self._words = buffer[:64].cast("Q")
+        self._separate = buffer[_SEPARATE : _SEPARATE + 8].cast("Q")
 
     @property
     def stopped_ns(self) -> int:
@@ -46,6 +49,11 @@ class Latch:
     def ended_stop_ns(self) -> int:
         """Which stop was the last that a reset has ended, as ``stopped_ns``; 0: none. As ``reset_ns``."""
         return self._words[_ENDED]
+
+    @property
+    def ended_ns(self) -> int:
+        """When that stop was ended [ns, CLOCK_MONOTONIC]; later resets may have ended none."""
+        return self._separate[0]
 
     @property
     def daemon_alive_ns(self) -> int:
@@ -91,7 +99,9 @@ class Latch:
             request: mark of the stop-request file that is thereby answered.
         """
         self._words[_RESET_AT] = now_ns
-        self._words[_ENDED] = self._words[_STOPPED] or self._words[_ENDED]
+        if self._words[_STOPPED]:
+            self._separate[0] = now_ns
+            self._words[_ENDED] = self._words[_STOPPED]
         self._words[_ANSWERED], self._words[_ANSWERED_AT] = request  # before the latch opens
         self._words[_RESETS] += 1
         self._words[_STOPPED] = 0
@@ -110,4 +120,5 @@ class Latch:
     def release(self) -> None:
         """Drop the views, so that the mapping can be closed."""
         self._words.release()
+        self._separate.release()
         self._bytes.release()

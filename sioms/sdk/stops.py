@@ -212,9 +212,9 @@ class Stops:
         latch, before_ns = self._latch, self._ended_ns
         self._ended_ns = ended_ns = latch.ended_stop_ns
         if ended_ns != before_ns:
-            self.resets.note_all(latch.reset_ns)
+            self.resets.note_all(latch.ended_ns)
             for handle in self._handles.values():
-                handle.note_reset(latch.reset_ns)
+                handle.note_reset(latch.ended_ns)
         else:  # the workcell was not stopped: of what its nodes are
             for block in self._blocks:
                 self._note_reset(block, self._stopped_of(block, range(block.n), -1), latch.reset_ns)

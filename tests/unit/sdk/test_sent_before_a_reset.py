@@ -190,6 +190,17 @@ def test_the_workcell_takes_nothing_of_before_its_reset(axes: World, is_seen: bo
     assert owner.served() == [errno.ECANCELED, None]
 
 
+def test_a_second_reset_that_ends_no_stop_makes_nothing_stale(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.jog()
+    axes.latch.stop(CLOCK(), "eva")
+    axes.latch.reset(CLOCK())
+    owner.jog()
+    CLOCK.now_ns += LATER_NS
+    axes.latch.reset(CLOCK())
+    assert owner.served() == [errno.ECANCELED, None]
+
+
 def test_a_reset_of_a_workcell_that_was_not_stopped_changes_nothing(axes: World) -> None:
     owner = Sender(axes, axes.open(0, [0], exclusive=True))
     owner.jog()
