@@ -21,7 +21,7 @@ from sioms.client.command import command
 from sioms.protocol.flags import AxisStatus
 
 from .figures import Bar, Report
-from .killing import WRONG, Tally, fork_servers, is_back, send
+from .killing import WRONG, Back, Tally, fork_servers, send
 from .options import Options
 from .watching import HISTORY
 from .workcells import workcell
@@ -140,9 +140,7 @@ def _round(daemon: Daemon, chance: random.Random, tally: Tally) -> None:
         daemon.start()
     with daemon.cell("judge") as cell:
         for name in DEVICES:
-            wait_for(
-                partial(is_back, daemon, cell, name, pids[name] if name in dead else 0), 60.0, f"{name} to be back"
-            )
+            wait_for(Back(cell, name, pids[name] if name in dead else 0), 60.0, f"{name} to be back")
         _judge_owners(cell, tally)
         if stopped:
             _judge_stop(cell, stopped, _named(acts), tally)
@@ -231,7 +229,7 @@ def _recover(daemon: Daemon, cell: Any) -> None:
         return False
 
     for name in DEVICES:
-        wait_for(partial(is_back, daemon, cell, name, 0), 60.0, f"{name} to be up")
+        wait_for(Back(cell, name, 0), 60.0, f"{name} to be up")
     with cell.open("bridge", "rw", 20.0) as node:
         wait_for(good, 30.0, "the bridge to be good")
 

@@ -171,7 +171,7 @@ def _round(daemon: Daemon, observer: Observer, kind: str, chance: random.Random,
             daemon.kill(pid)
             daemon.reap(pid)
         for name in drivers:
-            wait_for(partial(is_back, daemon, cell, name, pids[name]), 60.0, f"{name} to be back")
+            wait_for(Back(cell, name, pids[name]), 60.0, f"{name} to be back")
         _judge(cell, stopped, tally)
 
 
@@ -314,11 +314,21 @@ def _refuses(node: Any) -> bool:
     return False
 
 
-def is_back(daemon: Daemon, cell: Any, name: str, before: int) -> bool:
-    device = next(d for d in cell.status()["devices"] if d["name"] == name)
-    if device["state"] == "fault":  # it has died too often in short time
-        cell.reset(name)
-    return device["state"] == "up" and device["pid"] not in (0, before)
+class Back:
+    """Tells whether a device has another process than before; resets it once where it has died too often.
+
+    Once: the status may be a moment old, and a second reset would come when the device is up, and clear its stop.
+    """
+
+    def __init__(self, cell: Any, name: str, before: int) -> None:
+        self._cell, self._name, self._before, self._is_reset = cell, name, before, False
+
+    def __call__(self) -> bool:
+        device = next(d for d in self._cell.status()["devices"] if d["name"] == self._name)
+        if device["state"] == "fault" and not self._is_reset:
+            self._is_reset = True
+            self._cell.reset(self._name)
+        return device["state"] == "up" and device["pid"] not in (0, self._before)
 
 
 # --- its end -------------------------------------------------------------------------------------

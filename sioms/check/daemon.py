@@ -75,6 +75,7 @@ class Daemon:
                 stderr=log,
                 stdin=subprocess.DEVNULL,
                 preexec_fn=ends_with_us(),
+                start_new_session=True,  # the kernel lets stopped processes of a group go on that is orphaned in ours
             )
         self.pid = self.process.pid
         try:
