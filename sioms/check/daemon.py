@@ -132,6 +132,7 @@ class Daemon:
             status = 1
             try:
                 tie()
+                os.setsid()  # as the daemon
                 signal.signal(signal.SIGINT, signal.SIG_DFL)
                 signal.signal(signal.SIGTERM, signal.SIG_DFL)
                 work()
