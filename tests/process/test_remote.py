@@ -165,15 +165,22 @@ def test_a_link_that_delays_serves_and_one_that_doubles_ends_with_a_sentence(dae
             assert refused.value.errno in (errno.EIO, errno.ETIMEDOUT)
 
 
-@pytest.mark.parametrize("node", ["mod1", ""])
-def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
-    daemon: Daemon, gate: Gateway, cell: sioms.Workcell, node: str
-) -> None:
+@contextlib.contextmanager
+def behind_a_relay(gate: Gateway) -> Iterator[tuple[Relay, sioms.Workcell, sioms.AxisNode]]:
+    """A session whose frames a relay may hold up, and an axis that it holds."""
     with (
         Relay(gate.port) as relay,
         sioms.Workcell(gate.trusted(relay.port), "far") as far,
         far.open("mod1", "rw", lease=10.0) as axis,
     ):
+        yield relay, far, axis
+
+
+@pytest.mark.parametrize("node", ["mod1", ""])
+def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
+    daemon: Daemon, gate: Gateway, cell: sioms.Workcell, node: str
+) -> None:
+    with behind_a_relay(gate) as (relay, far, axis):
         axis.command(velocity=0.01)
         relay.treat(stalled=True)
         writing = Waiting(lambda: axis.command(velocity=0.05))
@@ -192,12 +199,7 @@ def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
 def test_a_reset_that_was_under_way_leaves_a_later_stop(
     daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str
 ) -> None:
-    with (
-        Relay(gate.port) as relay,
-        sioms.Workcell(gate.trusted(relay.port), "far") as far,
-        far.open("mod1", "rw", lease=10.0) as axis,
-        cell.open("mod1.readonly") as seen,
-    ):
+    with behind_a_relay(gate) as (relay, far, axis), cell.open("mod1.readonly") as seen:
         reset = {
             "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "of the workcell": lambda: far.reset()
         }[way]  # fmt: skip

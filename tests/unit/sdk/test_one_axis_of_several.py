@@ -28,6 +28,11 @@ def world() -> Iterator[World]:
         made[0].close()
 
 
+def _record(axis: int, flags: int = 0) -> bytes:
+    fields = {"axis": axis, "control_mode": int(ControlMode.VELOCITY | flags), "time": 1.0}
+    return AXIS_WRITE.pack(*(fields.get(name, 0) for name in WRITE[NodeClass.AXIS]))
+
+
 class Owner:
     """A client of both axes, and the answers that it has got."""
 
@@ -40,11 +45,13 @@ class Owner:
 
     def fill(self, what: str, axis: int) -> None:
         """Write more than has room, to an axis that waits for the synch, and wait for room."""
-        mode = int(ControlMode.VELOCITY | ControlMode.SPECIFIED_TIME | ControlMode.WAIT_FOR_EXTERNAL_SYNCH)
-        fields = {"axis": axis, "control_mode": mode, "time": 1.0}
-        record = AXIS_WRITE.pack(*(fields.get(name, 0) for name in WRITE[NodeClass.AXIS]))
-        self.send(f"{what}, first", self.client.node._write(record * (CAPACITY - 2), 0.0, False))
-        self.send(what, self.client.node._write(record * (CAPACITY - 2), 60.0, False))
+        records = _record(axis, ControlMode.SPECIFIED_TIME | ControlMode.WAIT_FOR_EXTERNAL_SYNCH) * (CAPACITY - 2)
+        self.send(f"{what}, first", self.client.node._write(records, 0.0, False))
+        self.send(what, self.client.node._write(records, 60.0, False))
+
+    def replace(self, what: str, axis: int) -> None:
+        """Replace the buffer of an axis."""
+        self.send(what, self.client.node._write(_record(axis), 0.0, True))
 
     def ask(self, request: Request, argument: Any = None) -> None:
         self.send(request.name, self.client.node._ioctl(request, argument, None))
@@ -71,14 +78,10 @@ def test_what_replaces_the_buffer_of_one_axis_ends_no_write_to_another(world: Wo
     owner = Owner(world)
     owner.fill("y", 1)
     owner.tick()
-    record = AXIS_WRITE.pack(*({"control_mode": int(ControlMode.VELOCITY)}.get(n, 0) for n in WRITE[NodeClass.AXIS]))
-    owner.send("x", owner.client.node._write(record, 0.0, True))
+    owner.replace("x", 0)
     owner.tick()
     assert type(owner.answers["x"]) is int and "y" not in owner.answers
-    record = AXIS_WRITE.pack(
-        *({"axis": 1, "control_mode": int(ControlMode.VELOCITY)}.get(n, 0) for n in WRITE[NodeClass.AXIS])
-    )
-    owner.send("y anew", owner.client.node._write(record, 0.0, True))
+    owner.replace("y anew", 1)
     owner.tick()
     assert owner.answers["y"].errno == errno.ECANCELED
 
