@@ -54,7 +54,8 @@ class Came(NamedTuple):
     Args:
         resets: how many resets had been seen when it was sent, at least; UNKNOWN: it may be older.
         timestamp_ns: of the kernel [ns, CLOCK_REALTIME].
-        latest_ns: when it was sent at the latest, by what a gateway has told [ns, CLOCK_MONOTONIC].
+        latest_ns: it is taken for no younger: what a gateway has told of when it was sent at the earliest [ns,
+            CLOCK_MONOTONIC].
     """
 
     resets: int
