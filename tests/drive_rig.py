@@ -47,7 +47,7 @@ class Joined:
         """Make a new driver: the one before was killed, the device goes on."""
         settings = msgspec.convert(self._table, self._driver.Settings)
         driver = self._driver("mod0", settings, self)  # type: ignore[arg-type]
-        self._overheard = driver.overheard
+        self._overheard, self._recovery_s = driver.overheard, driver.recovery_s
         self.unit: Any = driver.units[0]
         self.unit.clock = lambda: round(self.now_s * 1e9)
 
@@ -103,5 +103,6 @@ class Joined:
     def _decoded(self, exchange: Any, reply: bytes) -> Any:
         size = exchange.want(reply)
         if size is None or size > len(reply):
+            self.wait(exchange.timeout_s + self._recovery_s)
             raise LinkError("no reply")
         return exchange.decode(reply[:size])

@@ -56,6 +56,8 @@ SURE = 0.8
 NEAR_ZERO = 16
 """Microsteps within which a module has just been set to count from 0."""
 SELDOM_NS = 500_000_000
+LOST_REPLIES = 3
+"""Replies that are lost in one poll before the module counts as silent: of 1 % two are lost in every 500th poll."""
 PAD_S = 0.01
 """How long after a single byte, beside the time of the characters, the module has to say that it was the ninth."""
 DRIFT, JITTER_MS, TICKS_MS = 0.1, 200, 1000
@@ -191,6 +193,9 @@ class TmclUnit(AxesUnit):
         self._module = Module(settings.address, settings.host_address, settings.turnaround_s + on_line_s)
         self.framing = Framing(settings.address)
         self._pad_s = PAD_S + on_line_s * (SIZE + 1) / SIZE
+        # a reply that is lost costs its time-out, the silence behind it and the single bytes; a poll has some seven
+        lost_s = self._module.turnaround_s + settings.recovery_s + SIZE * self._pad_s
+        self.silence_s = max(self.silence_s, LOST_REPLIES * lost_s)
         self._motors = [axis.motor for axis in settings.axis]
         self._scales = [Scale.of(axis, settings) for axis in settings.axis]
         self._ramps: dict[tuple[int, Axis], int] = {}

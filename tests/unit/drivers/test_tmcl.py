@@ -47,7 +47,7 @@ def test_a_stop_gets_through_to_a_module_out_of_step(stray: int, silent: bool) -
     rig.do(rig.unit.halt(0, fastest=True))
     took_s = rig.now_s - began_s
     assert rig.device.motors[0].mover.top_speed == 0
-    assert took_s < (0.3 if silent else 0.15)
+    assert took_s < (1.0 if silent else 0.15)
     rig.wait(0.5)
     rig.sent.clear()
     rig.do(rig.unit.poll())  # all is in step again
@@ -342,3 +342,20 @@ def test_one_reply_of_another_parameter_is_no_restart(wrong: int) -> None:
         rig.device.take = take
         rig.wait(0.02)
     assert not rig.unit.bank.fault_text(0)
+
+
+@pytest.mark.parametrize("turnaround_s", [0.05, 0.15])
+@pytest.mark.parametrize("baud", [9600, 115200])
+def test_a_poll_that_loses_two_replies_is_no_lost_link(turnaround_s: float, baud: int) -> None:
+    """One reply of a hundred is lost on a poor line, and so two in every 500th poll."""
+    rig = opened({"turnaround_s": turnaround_s, "line": {"serial": "/x", "baud": baud}})
+    whole, asked = rig.device.take, 0
+
+    def take(data: bytes) -> list[bytes]:
+        nonlocal asked
+        asked += len(data) == 9
+        return [] if asked in (2, 4) and len(data) == 9 and whole(data) else whole(data)
+
+    began_s, rig.device.take = rig.now_s, take
+    rig.do(rig.unit.poll())
+    assert asked > 6 and 2 * turnaround_s < rig.now_s - began_s < rig.unit.silence_s
