@@ -86,7 +86,7 @@ class LineEngine(Connected):
             return
         for state in self._units:
             if state.is_up and self._is_silent(state):
-                error = LinkError(f"nothing for {state.silence_s:g} s")
+                error = LinkError(f"nothing for {state.silence_s:.2g} s")
                 self._lose_unit(state, self._told(state.unit, error), now_ns)
             if state.is_up:
                 for block in state.unit.blocks:

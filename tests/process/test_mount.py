@@ -101,6 +101,21 @@ def test_the_shell_reads_and_moves(files: Path, axis: sioms.AxisNode, cell: siom
     assert shell("echo 1 > nothing", files).returncode and shell("echo 1 > force0.all", files).returncode
 
 
+def test_a_number_that_a_block_cuts_is_one_number(files: Path, axis: sioms.AxisNode) -> None:
+    """Programs write what they have in blocks: "0.15" must not become 0.1, and then 5."""
+    first, last = b"0.05\n# ", b"\n0.1"
+    with open(files / "mod0" / "xaxis", "wb", buffering=0) as file:
+        assert file.write(first + b"x" * (4096 - len(first + last)) + last) == 4096
+        assert axis.read().position[0] == pytest.approx(0.05, abs=1e-3)
+        file.write(b"5\n")
+        assert axis.read().position[0] == pytest.approx(0.15, abs=1e-3)
+    with open(files / "mod0" / "xaxis", "wb", buffering=0) as file:
+        file.write(b"0.1\n" * 127 + b"0.05")
+    wait_for(lambda: "its last line has no end" in (files / ".log").read_text(), "what was left out is told")
+    assert "0x5401" not in (files / ".log").read_text(), "who asks whether this is a terminal is no news"
+    assert axis.read().position[0] == pytest.approx(0.1, abs=1e-3)
+
+
 def test_a_file_that_is_open_for_writing_is_held_and_closing_halts(
     files: Path, axis: sioms.AxisNode, cell: sioms.Workcell
 ) -> None:

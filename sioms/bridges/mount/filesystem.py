@@ -51,8 +51,8 @@ def served(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return function(self, path, *arguments)
         except OSError as error:
-            # Shells and completion look for files all the time; that one is not there is no news.
-            if not (function.__name__ == "getattr" and error.errno == errno.ENOENT):
+            # Shells and completion look for files all the time, and who opens a file asks whether it is a terminal.
+            if (function.__name__, error.errno) not in (("getattr", errno.ENOENT), ("ioctl", errno.ENOTTY)):
                 self._note(path, error)
             code = error.errno if error.errno and error.errno > 0 else errno.EIO
             raise OSError(code, error.strerror) from None
@@ -227,6 +227,9 @@ class Nodes(mfusepy.Operations):  # type: ignore[misc]
         if isinstance(file, NodeFile):
             self._notifier.forget(file)
             file.close()
+            if file.rest:
+                text = f"write {file.node.name}: its last line has no end, and was not carried out"
+                self.sentences.append((file.who.uid, f"{_now()} {file.who} {path}: {text}"))
 
     # --- read, write, wait -----------------------------------------------------------------------
 

@@ -10,16 +10,19 @@ or a command for one channel, which a node of several names or counts::
 
 by the words of ``sioms.command``, with ``relative``, ``synch`` and ``replace`` (instead of what the node does) beside
 them. What stands behind ``#`` is left out. All lines of one write are taken, or none.
+
+Programs that fill a buffer write whole blocks, wherever a line ends: the last line of a block waits for its end.
 """
 
 from __future__ import annotations
 
 import errno
+import math
 from struct import Struct
 from typing import Any
 
 from sioms.client.command import command
-from sioms.protocol.flags import NodeClass
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE, READ, VALUE, WRITE_STRUCT
 
@@ -29,6 +32,10 @@ SHOWN = {
     NodeClass.BINARY: ("data",),
 }
 """Columns of a line that is read, behind the index of the channel; those of ``devin``."""
+BLOCK, LARGE = 512, 4096
+"""Programs write what they have buffered in multiples of so many bytes; the kernel cuts what is large anywhere."""
+LONGEST = 65536
+"""Bytes of a line that may wait for its end."""
 _PLAIN = ("relative", "synch")
 _WHOLE = ("wait", "signal")
 
@@ -36,6 +43,26 @@ _WHOLE = ("wait", "signal")
 def bad(info: NodeInfo, what: str) -> OSError:
     """Return a refusal of what was written."""
     return OSError(errno.EINVAL, f"write {info.name}: {what}")
+
+
+def ended(rest: bytes, data: bytes) -> tuple[bytes, bytes]:
+    """Return the lines that are complete, and the beginning of one that waits for the next write.
+
+    Args:
+        rest: what has waited.
+        data: as it was written. A last line without its end is complete unless this may be a block of a longer text.
+
+    Example:
+        >>> ended(b"", b"0.1"), ended(b"0.0", b"5\\n")
+        ((b'0.1', b''), (b'0.05\\n', b''))
+        >>> ended(b"", b"0.1\\n" * 127 + b"0.05")[1]
+        b'0.05'
+    """
+    text = rest + data
+    if len(data) < LARGE and len(data) % BLOCK:
+        return text, b""
+    head, newline, tail = text.rpartition(b"\n")
+    return head + newline, tail
 
 
 def records(text: str, info: NodeInfo) -> tuple[bytes, bool]:
@@ -80,8 +107,13 @@ def whole_records(data: bytes, info: NodeInfo) -> bytes:
 
 
 def shown(snapshot: Any, info: NodeInfo) -> str:
-    """Return the lines of a snapshot, one a channel: its index, then the columns of ``SHOWN``."""
+    """Return the lines of a snapshot, one a channel: its index, then the columns of ``SHOWN``; nan where an analog
+    value is INVALID.
+    """
     columns = [getattr(snapshot, name) for name in SHOWN[info.node_class]]
+    if info.node_class is NodeClass.ANALOG:
+        told = zip(snapshot.data, snapshot.flags, strict=True)
+        columns = [[math.nan if flags & AnalogStatus.INVALID else value for value, flags in told]]
     rows = zip(range(len(info.channels)), *columns, strict=True)
     return "".join([" ".join([f"{value:.9g}" for value in row]) + "\n" for row in rows])
 
@@ -117,6 +149,8 @@ def _command(words: list[str], info: NodeInfo) -> bytes:
     if info.node_class is not NodeClass.AXIS:
         raise ValueError(f"{words[0][:40]!r} is not a number; want {_wanted(info)}")
     axis = 0
+    if not words:
+        raise ValueError(f"'replace' and nothing to do instead; want WORD=NUMBER with it, or {_wanted(info)}")
     if "=" not in words[0] and words[0] not in _PLAIN:
         axis = _axis(words.pop(0), info)
     elif len(info.channels) > 1:
@@ -124,6 +158,8 @@ def _command(words: list[str], info: NodeInfo) -> bytes:
     given: dict[str, Any] = {}
     for word in words:
         name, equals, value = word.partition("=")
+        if name in given:
+            raise ValueError(f"{name[:40]!r} is given twice")
         if not equals and name in _PLAIN:
             given[name] = True
         elif equals:

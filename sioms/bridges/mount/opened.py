@@ -107,17 +107,20 @@ class NodeFile:
         patience: for what waits.
 
     Attributes:
+        who: opened it.
+        rest: the beginning of a line whose end has not been written yet.
         is_closing: whether a descriptor of it has been closed since it was used last.
     """
 
     def __init__(
         self, cell: Workcell, node: Any, who: Caller, patience: Patience, *, binary: bool, nonblock: bool, owned: bool
     ) -> None:
-        self.node, self._cell, self._owned = node, cell, owned
+        self.node, self._cell, self._owned, self.who = node, cell, owned, who
         self._binary, self._nonblock, self._patience = binary, nonblock, patience
         self._users: dict[int, Process] = {}
         self._seen, self._bytes = 0, b""
         self._why = ""
+        self.rest = b""
         self.is_closing = False
         self.use(who.process.pid, who.process)
         if owned:
@@ -192,12 +195,25 @@ class NodeFile:
         if self._binary:
             records, replace = lines.whole_records(data, info), False
         else:
-            records, replace = lines.records(data.decode("utf-8", "replace"), info)
+            text, self.rest = lines.ended(self.rest, data)
+            if len(self.rest) > lines.LONGEST:
+                self.rest = b""
+                raise lines.bad(info, f"a line of more than {lines.LONGEST} bytes")
+            if not text:
+                return len(data)
+            records, replace = self._records_of(text, info)
         if self._nonblock or info.node_class is not NodeClass.AXIS:
             self.node.write(records, 0.0, replace=replace)
         else:
             self._wait(lambda: self._move(records, replace), tid)
         return len(data)
+
+    def _records_of(self, text: bytes, info: Any) -> tuple[bytes, bool]:
+        try:
+            return lines.records(text.decode("utf-8", "replace"), info)
+        except OSError:
+            self.rest = b""  # what comes next is not its end
+            raise
 
     def _move(self, records: bytes, replace: bool) -> None:
         self.node.write(records, None, replace=replace)

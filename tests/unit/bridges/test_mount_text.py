@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from sioms.bridges.mount.tree import Tree
 from sioms.client.cell_verbs import NodeEntry
 from sioms.client.command import command
 from sioms.client.snapshot import SNAPSHOT, Layout
-from sioms.protocol.flags import NodeClass
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 
@@ -71,6 +72,8 @@ def test_lines_become_records(text: str, records: bytes, replace: bool) -> None:
         ("xaxis position=fast", ["fast"]),
         ("xaxis speed=1", ["unknown word speed"]),
         ("xaxis position", ["WORD=NUMBER"]),
+        ("xaxis position=1 position=2", ["'position' is given twice"]),
+        ("replace", ["'replace' and nothing to do"]),
         ("xaxis time=1", ["no setpoint"]),
         ("xaxis position=1 wait=1.5", ["1.5"]),
         ("\0\xff", ["no axis"]),
@@ -79,6 +82,27 @@ def test_lines_become_records(text: str, records: bytes, replace: bool) -> None:
 def test_what_is_no_command_is_told_with_its_line(text: str, words: list[str]) -> None:
     with raises(errno.EINVAL, "write mod0", *words):
         lines.records(text, ARM)
+
+
+@pytest.mark.parametrize("block", [512, 4096, 131072, 131072 - 24])
+def test_the_last_line_of_a_block_waits_for_its_end(block: int) -> None:
+    """As ``seq`` writes: 4096 bytes at a time, and the kernel no more than 128 KiB; a number is cut anywhere."""
+    text = "".join(f"{0.1 + 1e-4 * i:.4f} 0\n" for i in range(20_000)).encode()
+    rest, whole = b"", []
+    for start in range(0, len(text), block):
+        lines_, rest = lines.ended(rest, text[start : start + block])
+        whole.append(lines.records(lines_.decode(), ARM)[0])
+    assert rest == b"" and b"".join(whole) == lines.records(text.decode(), ARM)[0]
+
+
+def test_a_short_write_needs_no_end() -> None:
+    for text in (b"0.1", b"0.1\n0.2", b"velocity=0.2"):
+        assert lines.ended(b"", text) == (text, b"")
+
+
+def test_what_is_invalid_is_no_number() -> None:
+    snapshot: Any = SimpleNamespace(data=(1.5, 2.5), flags=(0, int(AnalogStatus.INVALID | AnalogStatus.OVERRUN)))
+    assert lines.shown(snapshot, info(NodeClass.ANALOG, "a", "b")) == "0 1.5\n1 nan\n"
 
 
 def test_outputs_take_values_and_bits() -> None:
