@@ -1,8 +1,8 @@
 """``sioms epics``: nodes as process variables of EPICS PV Access, with alarms and units; stops may be put.
 
-One thread reads the pages and posts what has changed; the library's threads serve clients and carry out puts, so that
-no client is waited for. Set-points are taken only on request, and under a lease that the writer renews:
-docs/decisions/0336-pv-access-shows-and-stops.md, 0395-epics-clients-move-axes-under-a-lease.md
+One thread reads the pages and posts what has changed, one asks the daemon; the library's threads serve clients and
+carry out puts, so that no client is waited for. Set-points are taken only on request, and under a lease that the writer
+renews: docs/decisions/0336-pv-access-shows-and-stops.md, 0395-epics-clients-move-axes-under-a-lease.md
 """
 
 from __future__ import annotations
@@ -10,10 +10,11 @@ from __future__ import annotations
 import argparse
 import errno
 import ipaddress
+import math
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
-from time import monotonic
 from typing import Any, TypeAlias
 
 from p4p.nt import NTScalar
@@ -32,6 +33,8 @@ from sioms.protocol.text import printable
 PLACE = "127.0.0.1:5075"
 ASK_S = 0.5
 """How often nodes and alarms are asked for [s]."""
+SHOWN_S = 0.5
+"""Longest time that a put waits for a look that is under way, before it is answered without being shown [s]."""
 GONE = "cannot be read"
 Act: TypeAlias = Callable[[float, str, str], None]
 _NUMBER, _WHOLE, _TEXT = NTScalar("d", display=True, control=True), NTScalar("l", display=True), NTScalar("s")
@@ -73,6 +76,8 @@ def run(args: argparse.Namespace) -> int:
         putters.here = (host, int(server.conf()["EPICS_PVAS_SERVER_PORT"]))
         end_well()
         print(f"listening on {args.listen}", file=sys.stderr, flush=True)
+        bridge.ask()
+        threading.Thread(target=bridge.ask_again, name="nodes and alarms", daemon=True).start()
         while True:
             time.sleep(1.0 / args.rate)
             bridge.look()
@@ -156,25 +161,33 @@ class Shown:
         if self._kind is not _TEXT:
             told["display"] = {"description": self._channel.description}
         if self._kind is _NUMBER:
-            low, high = self._channel.minimum, self._channel.maximum
-            limits = {"limitLow": low or 0.0, "limitHigh": high or 0.0}  # both 0: none, as EPICS has it
+            low, high = bounds(self._channel)
+            limits = {"limitLow": low, "limitHigh": high}
             told["display"] |= {"units": self._channel.unit, **limits}
             told["control"] = limits
         return told
+
+
+def bounds(channel: ChannelInfo) -> tuple[float, float]:
+    """Return the lowest and highest value; both 0 for none, as EPICS has it, and an infinity for one that is not."""
+    low, high = channel.minimum, channel.maximum
+    if low is None and high is None:
+        return 0.0, 0.0
+    return -math.inf if low is None else low, math.inf if high is None else high
 
 
 def values(info: NodeInfo, channel: ChannelInfo, reading: Any) -> Iterator[tuple[str, NTScalar, Any]]:
     """Return what is shown of a channel: what follows its name, type and value."""
     match info.node_class:
         case NodeClass.AXIS:
-            moving = bool(reading.in_motion)
+            moving, (low, high) = bool(reading.in_motion), bounds(channel)
             for field in ("", ".VAL"):
                 yield field, _NUMBER, reading.commanded_position
             yield ".RBV", _NUMBER, reading.position
             yield ".VELO", _NUMBER, channel.limits.get("velocity", 0.0)
             yield ".DIFF", _NUMBER, reading.following_error
-            yield ".LLM", _NUMBER, channel.minimum or 0.0
-            yield ".HLM", _NUMBER, channel.maximum or 0.0
+            yield ".LLM", _NUMBER, low
+            yield ".HLM", _NUMBER, high
             yield ".DMOV", _WHOLE, int(not moving)
             yield ".MOVN", _WHOLE, int(moving)
             yield ".MSTA", _WHOLE, reading.status
@@ -190,7 +203,8 @@ def severity_of(node_class: NodeClass, reading: Any) -> tuple[int, str]:
         return 0, ""
     status = AxisStatus(reading.status) if node_class is NodeClass.AXIS else AnalogStatus(reading.flags)
     bad = [str(flag.name) for flag in type(status) if status & flag and flag.severity]
-    return status.severity, ", ".join(bad)
+    is_invalid = node_class is NodeClass.ANALOG and bool(status & AnalogStatus.INVALID)
+    return int(Severity.INVALID) if is_invalid else status.severity, ", ".join(bad)
 
 
 def worst(alarms: Iterable[dict[str, Any]], node: str, device: str, channel: str) -> tuple[int, str]:
@@ -211,7 +225,7 @@ class Bridge:
         putters: judges who may put.
         leases: by which clients hold nodes; None: they move nothing.
 
-    Concurrency: ``look`` in one thread; puts in any.
+    Concurrency: ``look`` in one thread, ``ask`` in another; puts in any.
     """
 
     def __init__(self, prefix: str, putters: Putters, leases: Leases | None = None) -> None:
@@ -225,18 +239,15 @@ class Bridge:
         self._nodes: dict[str, Any] = {}
         self._names: dict[str, str] = {}
         self._alarms: list[dict[str, Any]] = []
-        self._asked_s = -ASK_S
+        self._lock = threading.Lock()
+        """Of all that is shown: who has put something sees what came of it."""
 
     def look(self) -> None:
         """Post what has changed; what cannot be read is INVALID."""
-        if monotonic() > self._asked_s + ASK_S:
-            try:
-                self._ask()
-            except OSError:
-                if self._cell is not None:
-                    self._cell.close()
-                self._cell, self._nodes, self._names = None, {}, {}
-            self._asked_s = monotonic()
+        with self._lock:
+            self._look()
+
+    def _look(self) -> None:
         if self._leases is not None:
             self._leases.sweep()
         for name in self._names.keys() | self._of_node.keys():
@@ -248,13 +259,28 @@ class Bridge:
                 for shown in self._of_node.get(name, ()):
                     self._shown[shown].post(None, int(Severity.INVALID), error.strerror or GONE, None)
 
-    def _ask(self) -> None:
-        cell = self._cell = self._cell or Workcell(name="sioms epics")
-        entries = cell.nodes()
-        self._alarms = cell.alarms()
-        self._names = {e.name: e.name if e.read_only else e.name + READONLY for e in entries if not is_part(e, entries)}
-        for gone in self._of_node.keys() - self._names.keys():
-            self._remove(gone)
+    def ask(self) -> None:
+        """Ask for nodes and alarms; a daemon that hangs keeps nobody from seeing what drivers publish meanwhile."""
+        try:
+            cell = self._cell = self._cell or Workcell(name="sioms epics")
+            entries, alarms = cell.nodes(), cell.alarms()
+        except OSError:
+            with self._lock:
+                if self._cell is not None:
+                    self._cell.close()
+                self._cell, self._nodes, self._names = None, {}, {}
+            return
+        names = {e.name: e.name if e.read_only else e.name + READONLY for e in entries if not is_part(e, entries)}
+        with self._lock:
+            self._alarms, self._names = alarms, names
+            for gone in self._of_node.keys() - names.keys():
+                self._remove(gone)
+
+    def ask_again(self) -> None:
+        """Ask again and again."""
+        while True:
+            time.sleep(ASK_S)
+            self.ask()
 
     def _remove(self, node: str) -> None:
         """Take the variables of a node away: it is not in the workcell any more, or is another one."""
@@ -286,27 +312,36 @@ class Bridge:
                 act = self._mover(name, channel.name) if moves else None
                 self._post(name, f":{channel.name}{field}", kind, channel, act).post(value, *alarm, stamp_s)
             if info.node_class is NodeClass.AXIS:
-                act = self._judged(lambda on, _: self._stop(name, on), stops=True)
+                act = self._judged(name, lambda on, _: self._stop(name, on), stops=True)
                 stop = self._post(name, f":{channel.name}.STOP", _WHOLE, channel, act)
                 stop.post(0, 0, "", stamp_s)
         if self._leases is not None and info.node_class is NodeClass.AXIS:
             of = ChannelInfo("", "s", *LEASE_S, description="put again in time by who moves the node; 0: let go")
             leases = self._leases
-            act = self._judged(lambda seconds, who: leases.put(name, who, seconds))
+            act = self._judged(name, lambda seconds, who: leases.put(name, who, seconds))
             lease = self._post(name, ".LEASE", _NUMBER, of, act)
             lease.post(*leases.shown(name), stamp_s)
 
     def _mover(self, node: str, channel: str) -> Act | None:
         if (leases := self._leases) is None:
             return None
-        return self._judged(lambda position, who: leases.move(node, who, channel, position))
+        return self._judged(node, lambda position, who: leases.move(node, who, channel, position))
 
-    def _judged(self, act: Callable[[float, str], None], *, stops: bool = False) -> Act:
-        """Return a put that is judged before it is done; ``act`` takes the value, and the client in words."""
+    def _judged(self, node: str, act: Callable[[float, str], None], *, stops: bool = False) -> Act:
+        """Return a put that is judged before it is done, and shown before it is answered; ``act`` takes the value, and
+        the client in words.
+        """
 
         def judged(value: float, account: str, peer: str) -> None:
             self._putters.judge(peer, stops=stops)
             act(value, f"{printable(account, 32)}@{peer}")
+            if self._lock.acquire(timeout=SHOWN_S):
+                try:
+                    self._show(node)
+                except OSError:
+                    pass  # the next look says that it cannot be read
+                finally:
+                    self._lock.release()
 
         return judged
 

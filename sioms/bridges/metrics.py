@@ -244,7 +244,7 @@ def of_nodes(names: Iterable[str], readings: dict[str, tuple[NodeInfo, Any]]) ->
         readable.add_metric([name], name in readings)
     for name, (info, snapshot) in readings.items():
         published.add_metric([name], snapshot.number)
-        for each, reading in zip(info.channels, snapshot, strict=True):
+        for i, (each, reading) in enumerate(zip(info.channels, snapshot, strict=True)):
             where = [name, each.name]
             match info.node_class:
                 case NodeClass.AXIS:
@@ -257,7 +257,7 @@ def of_nodes(names: Iterable[str], readings: dict[str, tuple[NodeInfo, Any]]) ->
                         flags.add_metric([*where, str(flag.name).lower()], bool(status & flag))
                     severity.add_metric(where, status.severity)
                 case NodeClass.ANALOG:
-                    analog.add_metric([*where, each.unit], reading.data)
+                    analog.add_metric([*where, each.unit], snapshot.known[i])
                     severity.add_metric(where, AnalogStatus(reading.flags).severity)
                 case NodeClass.BINARY:
                     binary.add_metric(where, reading.data)

@@ -143,7 +143,7 @@ def _joints(info: NodeInfo) -> Callable[[Any], bytes]:
 
 def _wrench(info: NodeInfo) -> Callable[[Any], bytes]:
     frame = ros.part(info.name)
-    return lambda s: ros.wrench(s.utc.ns, frame, s.data)
+    return lambda s: ros.wrench(s.utc.ns, frame, s.known)
 
 
 class Bridge:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from sioms.protocol.clock import Clock, Utc
     from sioms.protocol.records import Column
 
+_INVALID, _NAN = int(AnalogStatus.INVALID), float("nan")
 _UNFIT = int(AnalogStatus.INVALID | AnalogStatus.SATURATED)
 _INSTANT = "changed_ns"
 """The column that is an instant by the clock of the cell."""
@@ -209,6 +210,11 @@ class AnalogSnapshot(Snapshot):
     """Analog channels in their declared units."""
 
     __slots__ = ()
+
+    @property
+    def known(self) -> tuple[float, ...]:
+        """Of each channel: its value, nan where it is flagged INVALID, for whoever passes on values without flags."""
+        return tuple([_NAN if flags & _INVALID else value for value, flags in zip(self.data, self.flags, strict=True)])
 
     def measured(self, channel: int | str = 0) -> float:
         """Return the value of a channel, for a program that acts on it: a guard, a control law.

@@ -95,8 +95,9 @@ class Device:
         return self.told(self.readings.read())
 
     def told(self, snapshot: Any) -> dict[str, Any]:
-        """Return the values of a snapshot."""
-        values = getattr(snapshot, VALUE[self.info.node_class])
+        """Return the values of a snapshot; an analog one that is INVALID is nan."""
+        is_analog = self.info.node_class is NodeClass.ANALOG
+        values = snapshot.known if is_analog else getattr(snapshot, VALUE[self.info.node_class])
         stamp_s = snapshot.utc.ns / 1e9
         return {key: {"value": value, "timestamp": stamp_s} for key, value in zip(self.keys, values, strict=True)}
 

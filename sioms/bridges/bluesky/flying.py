@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import threading
 import time
 import warnings
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from sioms.client.workcell import Workcell
+from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.records import VALUE
 from sioms.recording.live.files import LiveFile
 from sioms.recording.live.recorder import Recorder
@@ -202,7 +204,10 @@ def _events(recording: Recording, device: Device) -> Iterator[dict[str, Any]]:
     """Yield an event for each snapshot of a device."""
     column = VALUE[device.info.node_class]
     columns = [column, "commanded_position"] if isinstance(device, Axis) else [column]
-    table = recording.table(device.node_name, columns)
+    is_analog = device.info.node_class is NodeClass.ANALOG
+    table = recording.table(device.node_name, [*columns, "flags"] if is_analog else columns)
+    if is_analog:
+        table.values[column][(table.values["flags"] & AnalogStatus.INVALID) != 0] = math.nan
     keys = [*device.keys, f"{device.name}_setpoint"] if isinstance(device, Axis) else device.keys
     channels = range(len(device.info.channels))
     rows = zip(*[table.values[name][:, channel].tolist() for name in columns for channel in channels], strict=True)

@@ -17,18 +17,17 @@ Programs that fill a buffer write whole blocks, wherever a line ends: the last l
 from __future__ import annotations
 
 import errno
-import math
 from struct import Struct
 from typing import Any
 
 from sioms.client.command import command
-from sioms.protocol.flags import AnalogStatus, NodeClass
+from sioms.protocol.flags import NodeClass
 from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE, READ, VALUE, WRITE_STRUCT
 
 SHOWN = {
     NodeClass.AXIS: ("in_motion", "position", "velocity", "force"),
-    NodeClass.ANALOG: ("data",),
+    NodeClass.ANALOG: ("known",),
     NodeClass.BINARY: ("data",),
 }
 """Columns of a line that is read, behind the index of the channel; those of ``devin``."""
@@ -111,9 +110,6 @@ def shown(snapshot: Any, info: NodeInfo) -> str:
     value is INVALID.
     """
     columns = [getattr(snapshot, name) for name in SHOWN[info.node_class]]
-    if info.node_class is NodeClass.ANALOG:
-        told = zip(snapshot.data, snapshot.flags, strict=True)
-        columns = [[math.nan if flags & AnalogStatus.INVALID else value for value, flags in told]]
     rows = zip(range(len(info.channels)), *columns, strict=True)
     return "".join([" ".join([f"{value:.9g}" for value in row]) + "\n" for row in rows])
 

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -19,8 +21,8 @@ from p4p.client.thread import Context, RemoteError
 
 from sioms.bridges import epics
 from sioms.bridges.putters import Putters
-from sioms.protocol.flags import AxisStatus, NodeClass
-from sioms.protocol.nodeinfo import NodeInfo
+from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
+from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 
 
 class Node:
@@ -81,18 +83,22 @@ class Cell:
         pass
 
 
+def look(bridge: epics.Bridge) -> None:
+    bridge.ask()
+    bridge.look()
+
+
 @pytest.fixture
 def cell(monkeypatch: pytest.MonkeyPatch) -> Cell:
     made = Cell(Node("mod0.readonly"))
     monkeypatch.setattr(epics, "Workcell", lambda name: made)
-    monkeypatch.setattr(epics, "ASK_S", 0.0)
     return made
 
 
 @pytest.fixture
 def bridge(cell: Cell) -> epics.Bridge:
     made = epics.Bridge("lab:", Putters())
-    made.look()
+    look(made)
     return made
 
 
@@ -132,27 +138,27 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
     assert cell.node.stops == 0
     client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
     assert cell.node.stops == 1
-    bridge.look()
+    look(bridge)
     assert get(".DMOV") == 1
 
     cell.raised.append({"node": "mod0.xaxis", "severity": 1, "text": "too warm"})
-    bridge.look()
+    look(bridge)
     assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (1, "too warm")
     cell.node.status = int(AxisStatus.FAULT)
-    bridge.look()
+    look(bridge)
     assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (2, "FAULT")
     with pytest.raises(RemoteError, match=r"put to lab:mod0:xaxis.STOP: stop mod0.readonly: no right to"):
         client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
 
     cell.node.lost = "its driver is gone"
-    bridge.look()
+    look(bridge)
     assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (3, "its driver is gone")
     assert get(".RBV") == 0.125
     cell.node.status = 0
     client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
     assert cell.node.stops == 2, "also where it cannot be read"
     cell.node.lost = ""
-    bridge.look()
+    look(bridge)
     assert get(".RBV").severity == 1, "the alarm still stands"
 
 
@@ -165,18 +171,60 @@ def test_nan_stops_and_what_is_reloaded_or_gone_is_not_shown_as_before(
         client.put("lab:mod0:xaxis.VAL", 0.1, timeout=5.0)
 
     cell.node.lost = "its driver is gone"
-    bridge.look()
+    look(bridge)
     cell.node.lost = ""
     cell.node.info.channels[0].unit = "rad"
-    bridge.look()
+    look(bridge)
     assert client.get("lab:mod0:xaxis.RBV", timeout=5.0).raw["display.units"] == "rad"
     cell.empty = True
-    bridge.look()
+    look(bridge)
     with pytest.raises(TimeoutError):
         client.get("lab:mod0:xaxis.RBV", timeout=0.1)
     cell.empty = False
-    bridge.look()
+    look(bridge)
     assert client.get("lab:mod0:xaxis.RBV", timeout=5.0) == 0.125
+
+
+def test_a_daemon_that_hangs_keeps_nobody_from_seeing_what_drivers_publish(
+    client: Context, bridge: epics.Bridge, cell: Cell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hangs, asked = threading.Event(), threading.Event()
+    monkeypatch.setattr(cell, "alarms", lambda: (asked.set(), hangs.wait(20.0), [])[2])
+    asking = threading.Thread(target=bridge.ask)
+    asking.start()
+    assert asked.wait(5.0)
+    cell.node.moving = 0
+    bridge.look()
+    assert client.get("lab:mod0:xaxis.DMOV", timeout=5.0) == 1
+    hangs.set()
+    asking.join()
+
+
+def test_a_limit_that_is_not_configured_is_no_limit_at_0() -> None:
+    def told(low: float | None, high: float | None) -> tuple[float, float]:
+        return epics.bounds(ChannelInfo("x", "m", low, high))
+
+    assert [told(None, None), told(None, 1.0), told(0.2, None)] == [(0, 0), (-math.inf, 1.0), (0.2, math.inf)]
+
+
+def test_what_is_flagged_invalid_has_that_severity() -> None:
+    """MAJOR is a value that one may act upon."""
+    flags = AnalogStatus.INVALID | AnalogStatus.OVERRUN
+    assert epics.severity_of(NodeClass.ANALOG, SimpleNamespace(flags=int(flags))) == (3, "INVALID, OVERRUN")
+
+
+def test_a_put_that_is_answered_shows(cell: Cell) -> None:
+    """A script waits for .DMOV behind its put: it must not find the motion before."""
+    cell.node.moving = 0
+    held = SimpleNamespace(move=lambda *_: setattr(cell.node, "moving", 1), shown=lambda _: (0.5, 0, ""), sweep=bool)
+    bridge = epics.Bridge("", Putters(), held)  # type: ignore[arg-type]
+    look(bridge)
+    with serving(bridge) as client:
+        assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 1
+        client.put("mod0:xaxis.VAL", 0.1, timeout=5.0)
+        assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 0
+        client.put("mod0:xaxis.STOP", 1, timeout=5.0)
+        assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 1
 
 
 def mover() -> tuple[epics.Bridge, list[Any]]:
@@ -191,7 +239,7 @@ def mover() -> tuple[epics.Bridge, list[Any]]:
 
 def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -> None:
     bridge, calls = mover()
-    bridge.look()
+    look(bridge)
     with serving(bridge) as client:
         client.put("mod0.LEASE", 0.5, timeout=5.0)
         client.put("mod0:xaxis.VAL", 0.1, timeout=5.0)
@@ -213,7 +261,7 @@ def test_where_one_cannot_listen_is_told(bridge: epics.Bridge) -> None:
 def test_a_stranger_of_this_machine_reads_but_puts_nothing(cell: Cell) -> None:
     """He may say of himself what he likes: the kernel knows who has made his connection."""
     bridge, calls = mover()
-    bridge.look()
+    look(bridge)
     puts = [("mod0.LEASE", 0.5), ("mod0:xaxis.VAL", 0.1), ("mod0:xaxis.STOP", 1)]
     with serving(bridge):
         here = "{}:{}".format(*bridge._putters.here)

@@ -45,7 +45,7 @@ def reading(name: str, node_class: NodeClass, unit: str, **values: float) -> tup
 
 READINGS = {
     "mod0": reading("mod0", NodeClass.AXIS, "rad", position=0.25, force=-1.5, status=int(AxisStatus.FAULT)),
-    "force0": reading("force0", NodeClass.ANALOG, "N", data=math.nan, flags=2),
+    "force0": reading("force0", NodeClass.ANALOG, "N", data=7.0, flags=2),
     "io0": reading("io0", NodeClass.BINARY, "", data=5, edges=11),
 }
 

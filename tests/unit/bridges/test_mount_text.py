@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from types import SimpleNamespace
+from struct import pack
 from typing import Any
 
 import pytest
@@ -101,7 +101,10 @@ def test_a_short_write_needs_no_end() -> None:
 
 
 def test_what_is_invalid_is_no_number() -> None:
-    snapshot: Any = SimpleNamespace(data=(1.5, 2.5), flags=(0, int(AnalogStatus.INVALID | AnalogStatus.OVERRUN)))
+    flags = int(AnalogStatus.INVALID | AnalogStatus.OVERRUN)
+    snapshot: Any = SNAPSHOT[NodeClass.ANALOG](
+        bytes(32) + pack("<2d2q", 1.5, 2.5, 0, flags), Layout(NodeClass.ANALOG, 2, [0, 1], -1)
+    )
     assert lines.shown(snapshot, info(NodeClass.ANALOG, "a", "b")) == "0 1.5\n1 nan\n"
 
 
