@@ -226,7 +226,7 @@ class Bank(ABC):
             at_ns = self._catch_up(min(write.now_ns, latest_ns))
             # Working in an earlier one may have ended in a fault.
             commands = [c for c in write.commands if not self._queue.is_barred(c.axis)]
-            if not commands:
+            if not commands or self._begin_at_once(commands, at_ns, replace=write.replace):
                 continue
             axes = np.array(sorted({c.axis for c in commands}), dtype=np.int64)
             if write.replace:
@@ -467,6 +467,10 @@ class Bank(ABC):
 
     def _is_too_late(self, start_ns: int, now_ns: int) -> bool:
         """Tell whether a common start in the past is none any more."""
+        return False
+
+    def _begin_at_once(self, commands: Sequence[Command], now_ns: int, *, replace: bool) -> bool:
+        """Begin short writes that need no buffer; return False, and nothing is done, where they do."""
         return False
 
     def _emptied(self, axes: Axes) -> None:  # noqa: B027  # most loops have nothing to do

@@ -17,6 +17,7 @@ from sioms.protocol.flags import AxisStatus
 from . import axis_step
 from .axis_step import FORCE, HOLD, SETTLING, STOP
 from .bank import Axes, Bank
+from .commands import Command
 from .guard import LimitGuard
 from .homing import HomingRuns
 from .host_watch import HostWatch
@@ -24,6 +25,7 @@ from .law import ControlLaw
 from .queue import FAULT, LOST
 from .sequencer import Sequencer
 from .settings import SWITCH_MINUS, SWITCH_PLUS, AxisSettings
+from .short_way import ShortWay
 from .store import PlanStore
 from .types import EventKind, Keeper, MarkerPort
 
@@ -87,6 +89,7 @@ class AxisBank(Bank):
             tick_s,
         )  # fmt: skip
         self.plans = self._sequencer.plans(self._braked)
+        self._short_way = ShortWay(self._sequencer, self._queue, self._law, self.plans)
         self._braked_ns = 0
         """When the stop of these axes began [ns]; 0: there are none."""
         self._guard = LimitGuard(self._queue, self._sequencer, self._law.speed_most)
@@ -160,6 +163,9 @@ class AxisBank(Bank):
             self._sequencer.replaced(axes, now_ns)
         else:
             self._sequencer.appended(axes, now_ns)
+
+    def _begin_at_once(self, commands: Sequence[Command], now_ns: int, *, replace: bool) -> bool:
+        return self._short_way.begin(commands, now_ns, replace=replace)
 
     def _drop(self, axes: Axes) -> None:
         self._sequencer.drop(axes)

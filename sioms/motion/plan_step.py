@@ -30,7 +30,7 @@ class Plans(Record):
 
     ``awaited``: somebody waits for the end of a motion, which is the bank's then. Else steps note when the command of
     an axis has ended, ``ended_ns``, and when it came to rest, ``idle_ns``, by the ticks in which that was found [ns];
-    0: it has not. ``untold``: how much of it the bank has yet to tell.
+    0: it has not. ``untold``: how much of it the bank has yet to tell. ``state``: (3,) in which a command begins.
     """
 
     loop: Loop
@@ -58,6 +58,7 @@ class Plans(Record):
     ended_ns: Integers
     idle_ns: Integers
     untold: int
+    state: Floats
 
 
 @step

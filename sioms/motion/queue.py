@@ -212,14 +212,17 @@ class CommandQueue:
 
     def append_plain(self, commands: Sequence[Command], axes: NDArray[np.int64]) -> None:
         """Take plain commands of these axes, each of which has a head then."""
-        tail = self.tail
         for command in commands:
-            axis, mode = command.axis, command.control_mode
-            tail.state[axis] = (command.position, 0.0, 0.0) if mode & modes.POSITION else np.nan
-            if mode & modes.MAX_VEL_ACC:
-                tail.velocity[axis], tail.acceleration[axis] = command.max_velocity, command.max_acceleration
+            self.end_with(command)
         self._buffers.append_commands(commands)
         self.load_heads(axes)
+
+    def end_with(self, command: Command) -> None:
+        """A plain command is the last of its axis."""
+        tail, axis, mode = self.tail, command.axis, command.control_mode
+        tail.state[axis] = (command.position, 0.0, 0.0) if mode & modes.POSITION else np.nan
+        if mode & modes.MAX_VEL_ACC:
+            tail.velocity[axis], tail.acceleration[axis] = command.max_velocity, command.max_acceleration
 
     def forget_tail(self, axes: NDArray[np.int64]) -> None:
         """The buffers of these axes were emptied: what follows begins in a state not known here."""

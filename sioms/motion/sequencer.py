@@ -12,6 +12,7 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +44,15 @@ _MOVING = AxisStatus.MOVING
 _FORCE, _STOPPING = _MOVING | AxisStatus.FORCE_MODE, _MOVING | AxisStatus.STOPPING
 _KIND_STATUS = np.array([0, _MOVING, _MOVING, _FORCE, _MOVING, _STOPPING, _MOVING], dtype=np.int64)
 _HOMING = int(AxisStatus.HOMING)
+
+
+class Planned(NamedTuple):
+    """The plan of a command and its kind; whether the play is taken up at its end, and that is to be looked at."""
+
+    plan: Plan
+    kind: int
+    taken: bool
+    looked_at: bool
 
 
 class Sequencer:
@@ -144,6 +154,23 @@ class Sequencer:
         """Tell whether commands wait for the next tick, or to be planned ahead."""
         return bool(self._held or self._todo)
 
+    @property
+    def is_plain(self) -> bool:
+        """Tell whether no axis presses, or has, or is held back, and no arrival is looked at."""
+        return not (self.any_force or self._held or self.arrivals.watched or self._law.force_ends.any)
+
+    def is_taken_up(self, axis: int) -> bool:
+        """Tell whether the play of an axis is taken up at the end of what runs."""
+        return bool(self._row_taken[self.store.row.item(axis)])
+
+    def begun(self, axes: Sequence[int], now_ns: int) -> None:
+        """Go on behind plans that steps have begun at now on these axes, for which nothing else waits."""
+        store = self.store
+        self._ready[axes] = False
+        self.any_guard = bool(self.guard.any())
+        store.next_ns = min(store.next_ns, *map(store.end_ns.item, axes))
+        self.advance(now_ns)
+
     def begin_tick(self, dt: float) -> None:
         """A tick begins, dt after the last [s]: further commands may begin."""
         self._begun[:] = 0
@@ -205,7 +232,7 @@ class Sequencer:
             row_kind=self._row_kind, row_signals=self._row_signals, row_checked=self._row_checked,
             row_taken=self._row_taken, stopped=self.stopped, fresh=fresh,
             braked_ns=0, outcome=self.outcome, in_motion=self._in_motion, awaited=0, ended_ns=self._ended_ns,
-            idle_ns=self._idle_ns, untold=0, **store.segments,
+            idle_ns=self._idle_ns, untold=0, state=np.zeros(3), **store.segments,
         )  # fmt: skip
 
     def tell_ends(self) -> None:
@@ -442,12 +469,12 @@ class Sequencer:
             self.arrivals.tries[axes] = 0
         self._todo.update(dict.fromkeys(axes.tolist()))
         for row in rows[self._row_sets[rows]].tolist():
-            self._put_in_force(row // 2, self._row_command[row])
+            self.put_in_force(row // 2, self._row_command[row])
         self._queue.emit(EventKind.STARTED, axes, now_ns)
         self._settle_masks()
         self.refresh(axes)
 
-    def _put_in_force(self, axis: int, command: Command | None) -> None:
+    def put_in_force(self, axis: int, command: Command | None) -> None:
         """Put the gains, offset and limits that a command specifies in force; they stay."""
         if command is None:
             return
@@ -558,46 +585,55 @@ class Sequencer:
         command = self._queue.heads[axis]
         if command is None:
             return
-        mode = command.control_mode
-        running = int(self.store.row[axis])
-        row, approach = running ^ 1, self._approaches[axis] if is_point_move(mode) else None
-        taken = looked_at = False
         try:
-            if mode & modes.ANY_FORCE:
-                plan, kind = self._plan_force(axis, command), FORCE
-            elif approach is not None:
-                kind, taken = POSITION, bool(self._row_taken[running])
-                bounds = self._bounds(axis, command)
-                plan, taken, looked_at = plan_point(self._planner, command, state, bounds, approach, taken)
-            else:
-                plan = self._planner.plan(command, state, self._bounds(axis, command))
-                kind = POSITION if mode & modes.POSITION else RATE
+            planned = self.planned(axis, command, state, bool(self._row_taken[self.store.row[axis]]))
         except InfeasibleError as e:
             self._refuse(axis, str(e), now_ns)
             return
-        self.store.put(row, plan)
-        self._row_kind[row] = kind
-        self._row_guard[row] = plan.guard
-        self._row_command[row] = command
-        self._row_signals[row] = bool(mode & modes.SIGNAL_MARKER)
-        self._row_sets[row] = bool(mode & modes.SETTINGS)
-        self._row_checked[row], self._row_taken[row] = looked_at, taken
+        self.put(axis, command, planned)
         self._ready[axis] = True
+
+    def planned(self, axis: int, command: Command, state: State, taken: bool) -> Planned:
+        """Return the plan of a command.
+
+        Args:
+            axis: whose.
+            command: what is asked for.
+            state: in which it begins.
+            taken: the play of the axis is taken up, if it stands there.
+
+        Raises:
+            InfeasibleError: it is not possible.
+        """
+        mode = command.control_mode
+        if mode & modes.ANY_FORCE:
+            return Planned(self._plan_force(axis, command), FORCE, False, False)
+        bounds, approach = self._bounds(axis, command), self._approaches[axis] if is_point_move(mode) else None
+        if approach is not None:
+            plan, taken, looked_at = plan_point(self._planner, command, state, bounds, approach, taken)
+            return Planned(plan, POSITION, taken, looked_at)
+        plan = self._planner.plan(command, state, bounds)
+        return Planned(plan, POSITION if mode & modes.POSITION else RATE, False, False)
+
+    def put(self, axis: int, command: Command, planned: Planned) -> None:
+        """Write a plan into the other row of its axis."""
+        row, mode = self.store.row.item(axis) ^ 1, command.control_mode
+        self.store.put(row, planned.plan)
+        self._row_kind[row] = planned.kind
+        self._row_guard[row] = planned.plan.guard
+        self._row_command[row] = command
+        self._row_signals[row] = mode & modes.SIGNAL_MARKER != 0
+        self._row_sets[row] = mode & modes.SETTINGS != 0
+        self._row_checked[row], self._row_taken[row] = planned.looked_at, planned.taken
 
     def _bounds(self, axis: int, command: Command) -> Bounds:
         limits = self._limits
         if command.control_mode & modes.MAX_VEL_ACC:
             velocity, acceleration = command.max_velocity, command.max_acceleration
         else:
-            velocity, acceleration = float(self._velocity_limit[axis]), float(self._acceleration_limit[axis])
-        return Bounds(
-            velocity,
-            acceleration,
-            float(limits.jerk[axis]),
-            float(limits.minimum[axis]),
-            float(limits.maximum[axis]),
-            self._start_velocity[axis],
-        )
+            velocity, acceleration = self._velocity_limit.item(axis), self._acceleration_limit.item(axis)
+        jerk, low, high = limits.jerk.item(axis), limits.minimum.item(axis), limits.maximum.item(axis)
+        return Bounds(velocity, acceleration, jerk, low, high, self._start_velocity[axis])
 
     def _plan_force(self, axis: int, command: Command) -> Plan:
         limit = command.max_force if command.control_mode & modes.MAX_FORCE else float(self._law.force_limit[axis])

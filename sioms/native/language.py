@@ -34,6 +34,7 @@ MODULES: tuple[str, ...] = (
     "sioms.motion.axis_step",
     "sioms.motion.plan_step",
     "sioms.motion.stop_step",
+    "sioms.motion.begin_step",
     "sioms.motion.plain_step",
     "sioms.plant.friction_step",
     "sioms.plant.motor_step",
