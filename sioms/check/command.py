@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import shlex
 import subprocess
 import sys
@@ -60,6 +61,13 @@ def run_check(args: argparse.Namespace) -> int:
 def _one(name: str, args: argparse.Namespace, only: list[str]) -> dict[str, Any]:
     """Check one driver in this process, and print its trials as they end."""
     subject = subject_of(name, args.simulator, args.config)
+    place = subject.rig.kernel
+    if place and not args.simulator and not os.access(place, os.W_OK):
+        lacks = "you may not write" if os.path.exists(place) else "this one has no"
+        raise Unusable(
+            f"{name}: its device is simulated by the kernel, and {lacks} {place}; run it as root where there is one, "
+            "or have tests/kernel/run.py start a kernel that has"
+        )
     print(f"{name}: {'all trials' if args.full else 'quick trials'}", flush=True)
     results = check(subject, full=args.full, only=only, told=lambda result: print(line_of(result), flush=True))
     return {"driver": name, "full": args.full, "trials": [result.as_dict() for result in results]}

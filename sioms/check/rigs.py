@@ -80,7 +80,8 @@ class Rig:
         axes, analogs, inputs, outputs: its nodes.
         name: of the rig where it is not the driver's, as for register maps.
         checked: messages carry a checksum, so that damage can be told from data.
-        kernel: the kernel simulates the device, where it does: not among all, but found by name.
+        kernel: where a kernel that simulates the device has it made, '' where a program simulates it. Not every kernel
+            does: it is not among all, but found by name.
     """
 
     driver: str
@@ -93,7 +94,7 @@ class Rig:
     outputs: tuple[Output, ...] = ()
     name: str = ""
     checked: bool = True
-    kernel: bool = False
+    kernel: str = ""
 
     @property
     def title(self) -> str:

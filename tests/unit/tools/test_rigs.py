@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import tomllib
+from argparse import Namespace
+from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from sioms.bench.drivers import CASES, STREAMS, Case, faster
+from sioms.check import command
+from sioms.check.check import Subject
 from sioms.check.rigs import MAP_RIGS, RIGS, Axis, Rig, find_rig, rig_of
 
 KEYS = {
@@ -62,3 +67,23 @@ def test_the_bench_finds_its_drivers_and_makes_them_faster(case: Case) -> None:
 
 def test_the_streams_of_the_bench_are_there() -> None:
     assert all(find_rig(name) is not None for name, _ in STREAMS)
+
+
+@pytest.mark.parametrize("name", ["gpio", "iio-dummy"])
+def test_a_kernel_that_does_not_simulate_the_device_is_told_apart_from_a_failed_check(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig, checked = find_rig(name), list[str]()
+    assert rig is not None and rig.kernel.startswith("/sys/kernel/config/")
+    asked = Namespace(all=False, drivers=[name], only="", simulator="", config=None, full=False, json=None, report=None)
+
+    def check(subject: Subject, **_: object) -> list[object]:
+        checked.append(subject.rig.title)
+        return []
+
+    monkeypatch.setattr(command, "check", check)
+    for place, status in ((tmp_path / "none", command.USAGE), (tmp_path, 0)):
+        monkeypatch.setattr(command, "find_rig", lambda _, at=place: replace(rig, kernel=str(at)))
+        assert command.run_check(asked) == status
+    assert checked == [name]
+    assert f"simulated by the kernel, and this one has no {tmp_path / 'none'}" in capsys.readouterr().err
