@@ -16,9 +16,10 @@ from __future__ import annotations
 
 import asyncio
 import errno
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from select import POLLIN, poll
 from time import monotonic
+from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any, Self, TypeVar, overload
 
 from sioms.protocol import verbs
@@ -37,7 +38,8 @@ from .client.session import MarkerVerbs
 from .client.snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
+    from contextlib import AbstractContextManager
 
     from .client.coordinates import AsyncUserAxis
     from .client.overdue import Overdue
@@ -92,7 +94,7 @@ class _Requests(_Waiter):
     def __init__(self, channel: Channel, cancel: type[verbs.Cancel | verbs.CancelOnHandle]) -> None:
         self._channel = channel
         self._cancel_message = cancel
-        self._futures: dict[int, asyncio.Future[Answer]] = {}
+        self._futures: dict[int, tuple[asyncio.Future[Answer], Call]] = {}
         self._abandoned: dict[int, Call] = {}
         self._looks: dict[int, asyncio.TimerHandle] = {}
         self._loop = asyncio.get_running_loop()
@@ -102,7 +104,7 @@ class _Requests(_Waiter):
         """Send a request and wait for its answer; a cancelled task cancels the request."""
         number = self._channel.send(call)
         future: asyncio.Future[Answer] = self._loop.create_future()
-        self._futures[number] = future
+        self._futures[number] = future, call
         if call.limit_s is not None:
             due_s = monotonic() + call.limit_s
             self._looks[number] = self._loop.call_later(
@@ -113,11 +115,8 @@ class _Requests(_Waiter):
             return await future
         except asyncio.CancelledError:
             self._cancel(number, call)
-            if not future.cancelled() and future.exception() is None:  # it came first, and nobody takes it
-                answer = future.result()
-                answer.fds.close()
-                with suppress(OSError):
-                    self._undo(call, 0, answer.value)
+            if future.done() and not future.cancelled():  # it came first, and nobody takes it
+                self._take_unasked(call, future)
             raise
         finally:
             look = self._looks.pop(number, None)
@@ -143,10 +142,21 @@ class _Requests(_Waiter):
         if until_s:
             self._looks[number] = self._loop.call_later(until_s - now_s, self._look, number, call, due_s, overdue)
             return
-        future = self._futures.get(number)
+        future, _ = self._futures.get(number, (None, None))
         if future is not None and not future.done():
             future.set_exception(self._channel.late(call))
             self._cancel(number, call)
+
+    def _take_unasked(self, call: Call, future: asyncio.Future[Answer]) -> None:
+        """Let go of an answer that came just before the cancel did."""
+        error, refused, value = future.exception(), 0, None
+        if error is None:
+            future.result().fds.close()
+            value = future.result().value
+        else:
+            refused = (isinstance(error, OSError) and error.errno) or errno.EIO
+        with suppress(OSError):
+            self._undo(call, refused, value)
 
     def _undo(self, call: Call | None, refused: int, value: Any) -> None:
         """Undo what was done before the cancel came, or the answer reached who was cancelled: nobody else will."""
@@ -175,10 +185,10 @@ class _Requests(_Waiter):
         try:
             while (packet := self._channel.take()) is not None:
                 message, fds = packet
-                future = self._futures.pop(message[1], None)
-                if future is None or future.done():
+                future, call = self._futures.pop(message[1], (None, None))
+                if future is None or future.done():  # cancelled, of which its task may not have heard yet
                     fds.close()
-                    self._undo(self._abandoned.pop(message[1], None), message[2], message[3])
+                    self._undo(call or self._abandoned.pop(message[1], None), message[2], message[3])
                     continue
                 try:
                     future.set_result(self._channel.result(packet))
@@ -190,7 +200,7 @@ class _Requests(_Waiter):
 
     def _fail(self, error: OSError) -> None:
         futures, self._futures = self._futures, {}
-        for future in futures.values():
+        for future, _ in futures.values():
             if not future.done():
                 future.set_exception(error)
                 future.exception()  # whoever still waits gets it; who does not must not be warned
@@ -310,8 +320,13 @@ class AsyncFleetMarker(Awaiting, FleetMarkerVerbs):
 class _Together:
     """What waits for several cells in an event loop."""
 
-    async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+    async def calls(
+        self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]], sent: Callable[[], None] | None = None
+    ) -> list[Answer | OSError]:
         return await self.all([cell._waiter.call(call) for cell, call in calls])
+
+    def undisturbed(self) -> AbstractContextManager[Any]:
+        return nullcontext(SimpleNamespace(end=None))  # a loop heeds signals between steps alone
 
     async def all(self, steps: Sequence[Coroutine[Any, Any, Any]]) -> list[Any]:
         return await asyncio.gather(*steps, return_exceptions=True)

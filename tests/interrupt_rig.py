@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dis
+import signal
 import sys
 from collections.abc import Callable, Iterator
 from types import FrameType
@@ -17,10 +18,13 @@ class Interrupt:
         at: n.
         modules: their names.
         but: functions that are left out.
+        is_signal: it is a signal, which a handler of the program may put off.
     """
 
-    def __init__(self, at: int, modules: tuple[str, ...], but: tuple[str, ...] = ()) -> None:
-        self.left, self.modules, self.but = at, modules, but
+    def __init__(
+        self, at: int, modules: tuple[str, ...], but: tuple[str, ...] = (), *, is_signal: bool = False
+    ) -> None:  # fmt: skip
+        self.left, self.modules, self.but, self.is_signal = at, modules, but, is_signal
         self.last: dict[FrameType, int] = {}
 
     def __call__(self, frame: FrameType, event: str, argument: object) -> Interrupt | None:
@@ -34,13 +38,17 @@ class Interrupt:
                 self.left -= 1
                 if self.left == 0:
                     self.last.clear()  # frames keep what was under way
-                    raise KeyboardInterrupt
+                    if self.is_signal:
+                        signal.raise_signal(signal.SIGINT)
+                    else:
+                        raise KeyboardInterrupt
         return self
 
 
 def interrupted_everywhere(
-    do: Callable[[], object], modules: tuple[str, ...], but: tuple[str, ...] = (), step: int = 1
-) -> Iterator[int]:
+    do: Callable[[], object], modules: tuple[str, ...], but: tuple[str, ...] = (), step: int = 1,
+    is_signal: bool = False,
+) -> Iterator[int]:  # fmt: skip
     """Do something again and again, interrupted one place (or ``step``) later each time, until it is done.
 
     Yields each place, after its interrupt.
@@ -48,7 +56,7 @@ def interrupted_everywhere(
     at, tracing = 0, sys.gettrace()
     while True:
         at, interrupted = at + step, False
-        sys.settrace(Interrupt(at, modules, but))
+        sys.settrace(Interrupt(at, modules, but, is_signal=is_signal))
         try:
             do()
         except KeyboardInterrupt:

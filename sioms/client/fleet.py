@@ -15,10 +15,11 @@ from .channel import Answer, Call
 from .faces import Blocking, run
 from .fleet_places import wanted
 from .fleet_verbs import FleetError, FleetMarkerVerbs, FleetVerbs
+from .undisturbed import Undisturbed
 from .workcell import Workcell
 
 if TYPE_CHECKING:
-    from collections.abc import Coroutine, Iterable, Mapping, Sequence
+    from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
 
 __all__ = ["Fleet", "FleetError", "FleetMarker"]
 THREADS = 64
@@ -33,28 +34,37 @@ class _Together:
     def __init__(self) -> None:
         self._threads: ThreadPoolExecutor | None = None
 
-    async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+    async def calls(
+        self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]], sent: Callable[[], None] | None = None
+    ) -> list[Answer | OSError]:
         try:
-            return self._calls(calls)
+            return self._calls(calls, sent)
         except BaseException:  # of a signal, at whichever cell it comes: nobody waits for the others any more
             for cell, call in calls:
                 cell._channel.abandon(call)
             raise
 
-    def _calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
+    def undisturbed(self) -> Undisturbed:
+        return Undisturbed()
+
+    def _calls(
+        self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]], when_sent: Callable[[], None] | None
+    ) -> list[Answer | OSError]:
         carriers = [carrier for cell, _ in calls if (carrier := cell._channel.carrier) is not None]
         if len(carriers) < 2:
-            return self._answers(calls, self._send(calls))
+            return self._answers(calls, self._send(calls, when_sent))
         from .carrying import Led
 
         beats_s = [beat_s for cell, _ in calls if (beat_s := cell._channel.keepalive_s)]
         with Led(carriers) as led:
-            sent = self._send(calls)
+            sent = self._send(calls, when_sent)
             if not any(isinstance(number, OSError) for number in sent):
                 led.wait(min([MOST_LED_S, *beats_s]))
         return self._answers(calls, sent)
 
-    def _send(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[int | OSError]:
+    def _send(
+        self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]], when_sent: Callable[[], None] | None
+    ) -> list[int | OSError]:
         sent: list[int | OSError] = []
         is_stop = any(isinstance(call.message, EmergencyStop) for _, call in calls)
         with Briefly() if is_stop else nullcontext():  # who hears of it here shall not hold up those who have not yet
@@ -63,6 +73,8 @@ class _Together:
                     sent.append(cell._channel.send(call))
                 except OSError as error:
                     sent.append(error)
+        if when_sent is not None:
+            when_sent()
         return sent
 
     def _answers(

@@ -22,6 +22,7 @@ from .wall import wall
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterator, Mapping, Sequence
+    from contextlib import AbstractContextManager
 
     from sioms.protocol.nodeinfo import NodeInfo
 
@@ -38,8 +39,13 @@ C = TypeVar("C", bound=WorkcellVerbs[Any])
 class Together(Protocol):
     """What waits for several things at once, each face in its own way."""
 
-    async def calls(self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]]) -> list[Answer | OSError]:
-        """Send a request to each of several cells, then wait for all answers."""
+    async def calls(
+        self, calls: Sequence[tuple[WorkcellVerbs[Any], Call]], sent: Callable[[], None] | None = None
+    ) -> list[Answer | OSError]:
+        """Send a request to each of several cells, then wait for all answers; ``sent`` is called in between."""
+
+    def undisturbed(self) -> AbstractContextManager[Any]:
+        """Return what puts off interrupts in a ``with`` block, or until its ``end``; a cancelled task has none."""
 
     async def all(self, steps: Sequence[Coroutine[Any, Any, Any]]) -> list[Any]:
         """Run coroutines side by side; return what each returns, or raises."""
@@ -291,15 +297,16 @@ class FleetVerbs(Generic[C]):
         """
         why = printable(str(why))
         calls = []
-        try:
-            for cell in self.cells.values():
-                call = Call("emergency stop", verbs.EmergencyStop("", why))
-                call.enough = request_stop(cell._request, why)
-                calls.append((cell, call))
-            answers = await self._together.calls(calls)
-        except BaseException:  # interrupted, or cancelled: all hear of it before this ends
-            self._stop_unasked(why)
-            raise
+        with self._together.undisturbed() as undisturbed:
+            try:
+                for cell in self.cells.values():
+                    call = Call("emergency stop", verbs.EmergencyStop("", why))
+                    call.enough = request_stop(cell._request, why)
+                    calls.append((cell, call))
+                answers = await self._together.calls(calls, undisturbed.end)
+            except BaseException:  # cancelled, as a rule: all hear of it before this ends
+                self._stop_unasked(why)
+                raise
         errors = dict(self.missing)
         for name, (_, call), answer in zip(self.cells, calls, answers, strict=True):
             if isinstance(answer, OSError) and not (call.enough and call.enough()):
@@ -315,15 +322,11 @@ class FleetVerbs(Generic[C]):
 
     def _stop_unasked(self, why: str) -> None:
         """Tell all cells to stop, without waiting for their answers; a second time does no harm."""
-        told: set[str] = set()
-        for name in [*self.cells, *self.cells]:  # once more for one at which a second interrupt comes
-            if name in told:
-                continue
-            cell, call = self.cells[name], Call("emergency stop", verbs.EmergencyStop("", why))
-            with suppress(OSError, KeyboardInterrupt):
+        for cell in self.cells.values():
+            call = Call("emergency stop", verbs.EmergencyStop("", why))
+            with suppress(OSError):
                 request_stop(cell._request, why)
                 cell._channel.send(call)
-                told.add(name)
                 cell._channel.abandon(call)
 
     async def _stop_again(self, name: str, why: str) -> None:

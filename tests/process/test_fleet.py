@@ -195,6 +195,29 @@ def test_a_stop_that_is_interrupted_while_it_tells_the_cells_reaches_all_or_none
     fleet.reset()
 
 
+def test_a_second_interrupt_of_a_stop_leaves_no_cell_out(fleet: sioms.Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first comes when one cell has been asked by its file; the second at every place of what follows."""
+
+    async def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def stop() -> None:
+        with monkeypatch.context() as patch:
+            patch.setattr(fleet._together, "calls", interrupted)
+            fleet.emergency_stop("enough")
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        for at in interrupted_everywhere(stop, ("sioms.client.fleet_verbs",), is_signal=True):
+            found = {name: bool(status["stopped_ns"]) for name, status in _settled(fleet).items()}
+            assert len({*found.values()}) == 1, f"place {at}: {found}"
+            _reset(fleet)
+            if at > 60:
+                break  # the first interrupt ends each of them
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
 def _reset(fleet: sioms.Fleet) -> None:
     """Reset all cells, though a stop that nobody waited for may come as late as that: then it has to be seen first."""
 

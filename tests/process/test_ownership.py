@@ -116,8 +116,11 @@ def test_a_waiting_open_can_be_cancelled(daemon: Daemon, cell: sioms.Workcell) -
     cell.open("mod0", "rw", timeout=1.0).close()
 
 
-def test_an_open_that_is_cancelled_when_its_answer_has_come_leaves_nothing_open(daemon: Daemon) -> None:
-    """The answer is there, and who asked for it is cancelled before the loop has come to it."""
+@pytest.mark.parametrize("is_read_first", [True, False])
+def test_an_open_that_is_cancelled_when_its_answer_has_come_leaves_nothing_open(
+    daemon: Daemon, is_read_first: bool
+) -> None:
+    """The answer is there, and who asked for it is cancelled before the loop has come to it, or to its task."""
     asked = {1: lambda other: other.open("mod0", "rw"), 3: lambda other: other.reserve_marker()}
 
     async def story() -> None:
@@ -127,9 +130,12 @@ def test_an_open_that_is_cancelled_when_its_answer_has_come_leaves_nothing_open(
                 task = asyncio.create_task(ask(other))
                 await asyncio.sleep(0)
                 requests = other._waiter
+                if not is_read_first:
+                    task.cancel()
                 while requests._futures:
                     requests._readable()
-                task.cancel()
+                if is_read_first:
+                    task.cancel()
                 with pytest.raises(asyncio.CancelledError):
                     await task
             await asyncio.sleep(0.05)
