@@ -5,6 +5,8 @@ Below everything that acts on it: stops, alarms, clients, processes and the serv
 
 from __future__ import annotations
 
+from sioms.timestamps import Timestamps
+
 from .config import Config, QuotaTable, WorkcellTable
 from .devices import DriverProcess
 from .log import Log
@@ -27,6 +29,7 @@ class Cell:
     Attributes:
         config: the configuration in force; None until the first one is taken up.
         names: the nodes of that configuration.
+        timestamps: tell when something was sent.
         devices: by name.
         leaving: devices of before that are ending, by name.
         watched_inputs: for each device the blocks with emergency-stop inputs that must be readable, and the node of
@@ -37,6 +40,7 @@ class Cell:
         self.loop = loop
         self.log = log
         self.shared = shared
+        self.timestamps = Timestamps()
         self.config: Config | None = None
         self.names = NameTable({}, {})
         self.devices: dict[str, DriverProcess] = {}

@@ -11,8 +11,10 @@ import os
 import socket
 from collections.abc import Callable
 
+from sioms.descriptors import enable_timestamps
 from sioms.protocol.flags import Right
 from sioms.protocol.messages import refusal
+from sioms.timestamps import pending_bytes
 
 from .cell import Cell
 from .clients import Clients
@@ -57,7 +59,9 @@ class Door:
         if why := self._why_not(peer):
             self._refuse(sock, peer, why)
             return
+        enable_timestamps(sock)
         loop, session = self._cell.loop, self._clients.begin(sock, peer)
+        session.early_bytes = pending_bytes(sock)
         loop.turns.add(sock.fileno(), peer.uid, 0, lambda: self._receive(session))
         session.greeting = loop.after(self._cell.quotas.greeting_s, lambda: self._was_silent(session))
         if session.pidfd >= 0:

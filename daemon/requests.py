@@ -15,6 +15,7 @@ from typing import Any
 from sioms.protocol import verbs
 from sioms.protocol.journal import Note
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, refusal, reply
+from sioms.timestamps import receive
 
 from .alarm_keeper import AlarmKeeper
 from .alarm_verbs import AlarmVerbs
@@ -56,6 +57,7 @@ class Requests:
         self.nodes = NodeVerbs(cell, clients)
         self.markers = MarkerVerbs(cell, clients)
         self.supervision = Supervision(cell.loop, lambda: cell.bounds.supervisor_lease_s, stops.stop_workcell)
+        cell.loop.watch(cell.timestamps.fd, cell.timestamps.look_at_clock)
         self._stops = StopVerbs(cell, clients, stops, self.nodes, self.supervision)
         self._alarms = AlarmVerbs(cell, clients, alarms, self.nodes)
         self._workcell = WorkcellVerbs(cell, clients, self.nodes, self.markers, load)
@@ -66,7 +68,7 @@ class Requests:
         if session not in self._clients.sessions:
             return
         try:
-            packet = session.sock.recv(MAX_PACKET + 1)
+            packet, timestamp_ns = receive(session.sock, MAX_PACKET + 1)
         except BlockingIOError:
             return
         except OSError:
@@ -74,6 +76,8 @@ class Requests:
         if not packet:
             self._clients.end(session, "")
             return
+        session.timestamp_ns = 0 if session.early_bytes else timestamp_ns
+        session.early_bytes = max(0, session.early_bytes - len(packet))
         try:
             self._dispatch(session, *verbs.take(packet, verbs.FROM_CLIENT, pending=session.waits))
         except MalformedMessage as error:
@@ -92,6 +96,11 @@ class Requests:
                 self.markers.end_session(session)
         self.markers.take_up_rights()
         self.nodes.take_up_rights()
+
+    def close(self) -> None:
+        """Release the descriptor that is no session's."""
+        self._cell.loop.unwatch(self._cell.timestamps.fd)
+        self._cell.timestamps.close()
 
     def _end_session(self, session: Session) -> None:
         """Take from a session that has ended what it had."""

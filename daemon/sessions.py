@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import socket
 import struct
@@ -100,6 +101,9 @@ class Session:
         greeted: whether it has said hello.
         leash: of the journals that it reads; None: of none.
         said_ns: when the reset that follows was sent at the earliest [ns, CLOCK_MONOTONIC]; 0: it has not been said.
+        timestamp_ns: of the packet that is served, by the kernel [ns, CLOCK_REALTIME]; 0: it has none.
+        early_bytes: how much lies in its socket that was sent before there were timestamps.
+        number: no other session has had it.
     """
 
     sock: socket.socket
@@ -112,6 +116,9 @@ class Session:
     greeted: bool = False
     leash: Leash | None = None
     said_ns: int = 0
+    timestamp_ns: int = 0
+    early_bytes: int = 0
+    number: int = field(default_factory=itertools.count(1).__next__)
 
     @property
     def user(self) -> str:

@@ -17,7 +17,8 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from sioms.protocol.stopjournal import CHECKPOINT, PID, StopJournal, Stopped, entries_from, replay
+from sioms.part_times import PartTimes
+from sioms.protocol.stopjournal import CHECKPOINT, PID, StopJournal, Stopped, asked_ns, entries_from, replay
 
 from .realtime import end_promptly
 
@@ -41,6 +42,7 @@ class StopRecord:
         state: what is stopped, after the last ``look``.
         drivers_fd: descriptor for drivers, to append to.
         by_drivers: entries of drivers that have been read, the oldest first; who has seen to them takes them out.
+        asked: when stops have been asked for since this daemon began.
     """
 
     def __init__(self, path: str) -> None:
@@ -62,6 +64,7 @@ class StopRecord:
         start = max(_first_byte(self._fd, size), size - LARGEST)
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
         self.by_drivers: list[Mapping[str, Any]] = []
+        self.asked = PartTimes()
         self._at = size
         self._checked_at = start
         self._flusher = _Flusher(self._fd)
@@ -92,6 +95,8 @@ class StopRecord:
             self.state.take(entry, now_s=time.time())
             if entry and PID in entry:
                 self.by_drivers.append(entry)
+                for device, block, channel, bit in self.state.still(entry):
+                    self.asked.note((device, block), [(channel, bit)], asked_ns(entry, time.monotonic_ns()))
         if read:
             self._flusher.flush()
         return True

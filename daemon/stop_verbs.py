@@ -47,11 +47,11 @@ class StopVerbs:
                     errno.EPERM,
                     f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
                 )
-            self._stops.stop_for(session.peer.pid, source)
+            self._stops.stop_for(session.peer.pid, source, session.number)
             return
         node = self._nodes.find(session, "emergency stop", name, message.right)
         try:
-            self._stops.stop_node(node, source)
+            self._stops.stop_node(node, source, session.number)
         except OSError as error:
             raise Refused(errno.EIO, f"emergency stop of {name}: {error.strerror}") from None
 
@@ -63,10 +63,20 @@ class StopVerbs:
             raise Refused(errno.EINVAL, f"supervise: lease {message.lease_s:g} s; want more than 0")
         return self._supervision.renew(session, message.lease_s)
 
+    def _sent_ns(self, session: Session, said_ns: int) -> int:
+        """Return when the reset that is served was sent, at the earliest [ns, CLOCK_MONOTONIC].
+
+        Args:
+            session: whose it is.
+            said_ns: what a gateway has said of it; 0: nothing.
+        """
+        sent_ns = self._cell.timestamps.monotonic_ns(session.timestamp_ns)
+        return min(sent_ns, said_ns) if said_ns else sent_ns
+
     def reset(self, session: Session, message: Reset) -> None:
         """Reset the workcell, or a node, or the fault of its device."""
         (name,) = message
-        sent_ns, session.said_ns = session.said_ns, 0
+        said_ns, session.said_ns = session.said_ns, 0
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
@@ -74,10 +84,14 @@ class StopVerbs:
                 raise Refused(errno.EPERM, "reset: the workcell has no supervisor; start `sioms supervise`")
             if source := self._stops.hear_request():
                 raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
-            if sent_ns and self._stops.stopped_since(sent_ns):
-                source = self._cell.shared.latch.source
-                raise Refused(errno.EAGAIN, f"reset: stopped ({source}) after this was sent; see why, and reset again")
-            self._stops.reset_workcell(str(session))
+            sent_ns = self._sent_ns(session, said_ns)
+            if self._stops.stopped_since(sent_ns, session.number):
+                by = f" ({source})" if (source := self._cell.shared.latch.source) else ""
+                raise Refused(
+                    errno.EAGAIN,
+                    f"reset: the workcell, or a node, stopped{by} after this was sent; see why, and reset again",
+                )
+            self._stops.reset_workcell(str(session), sent_ns, session.number)
             return
         node = self._nodes.find(session, "reset", name, message.right)
         device = self._cell.devices.get(node.device)
@@ -88,10 +102,11 @@ class StopVerbs:
         latch = self._cell.shared.latch
         if latch.stopped_ns:
             raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
-        if sent_ns and self._stops.stopped_since(sent_ns, node):
+        sent_ns = self._sent_ns(session, said_ns)
+        if self._stops.stopped_since(sent_ns, session.number, node):
             raise Refused(errno.EAGAIN, f"reset {name}: stopped after this was sent; see why, and reset again")
         try:
-            self._stops.reset_node(node, str(session))
+            self._stops.reset_node(node, str(session), sent_ns, session.number)
         except OSError as error:
             raise Refused(errno.EIO, f"reset {name}: {error.strerror}") from None
         if device is not None:

@@ -19,6 +19,9 @@ from .cell import Cell
 from .devices import DriverProcess
 from .names import Node
 
+FILE_CLOCK_NS = 10_000_000
+"""How far the time of a file's last change may lie before it: the kernel's clock of files goes in ticks [ns]."""
+
 
 class Stops:
     """The emergency stop of the workcell, and the stops of its nodes.
@@ -31,10 +34,6 @@ class Stops:
         self._cell = cell
         self._shared = cell.shared
         self._request_seen = self._shared.request.mark
-        self._stopped_ns = 0
-        """When somebody last asked for the stop of the workcell, stopped already or not."""
-        self._nodes_stopped_ns: dict[tuple[str, int, int], int] = {}
-        """The same of channels of nodes: device, block, channel."""
 
     def restore(self) -> None:
         """Be stopped from the beginning when it was so at the end."""
@@ -48,11 +47,17 @@ class Stops:
         if self._shared.files.unheard:
             self.stop_workcell(self._shared.files.unheard)
 
-    def stop_workcell(self, source: str) -> None:
-        """Latch the emergency stop, wake every driver, and keep it."""
-        latch = self._shared.latch
-        self._stopped_ns = time.monotonic_ns()
-        known = not latch.stop(time.monotonic_ns(), source) and not (
+    def stop_workcell(self, source: str, by: int = 0, asked_ns: int = 0) -> None:
+        """Latch the emergency stop, wake every driver, and keep it.
+
+        Args:
+            source: who asks for it, and why.
+            by: number of the session that does; 0: none.
+            asked_ns: when that was, at the latest [ns, CLOCK_MONOTONIC]; 0: now.
+        """
+        latch, now_ns = self._shared.latch, time.monotonic_ns()
+        self._shared.record.asked.note_all(asked_ns or now_ns, by)
+        known = not latch.stop(now_ns, source) and not (
             source != latch.source and latch.source in (SOMEBODY, self._shared.request.source)
         )
         if not known:
@@ -73,11 +78,21 @@ class Stops:
             return ""
         self._request_seen = mark
         source, heard = request.source, request.taken(mark[0])
-        self.stop_workcell(source)
+        self.stop_workcell(source, asked_ns=self._written_ns(mark))
         request.take(mark)
         return "" if heard else source
 
-    def stop_for(self, pid: int, source: str) -> None:
+    def _written_ns(self, mark: tuple[int, int]) -> int:
+        """Return when a request was written to the file [ns, CLOCK_MONOTONIC]: as its word says, if the time of the
+        file's change does not contradict it; else at the latest; 0: that is not known.
+        """
+        word, changed_ns = mark
+        written_ns = self._cell.timestamps.monotonic_ns(changed_ns)
+        if written_ns and abs(word - written_ns) < FILE_CLOCK_NS:
+            return word
+        return written_ns and min(written_ns + FILE_CLOCK_NS, time.monotonic_ns())
+
+    def stop_for(self, pid: int, source: str, by: int = 0) -> None:
         """Stop the workcell for a session. A request that its process has made, and nobody heard yet, is the same stop:
         clients write one ahead, for the drivers, in case that we hang.
         """
@@ -87,16 +102,23 @@ class Stops:
             self._request_seen = mark
         else:
             self.hear_request()
-        self.stop_workcell(source)
+        self.stop_workcell(source, by)
         if is_same:
             request.take(mark)
 
-    def reset_workcell(self, who: str) -> None:
-        """Clear the latch and give devices in fault another try; nothing moves by itself."""
+    def reset_workcell(self, who: str, sent_ns: int, by: int) -> None:
+        """Clear the latch and give devices in fault another try; nothing moves by itself.
+
+        Args:
+            who: asks for it.
+            sent_ns: when that was sent, at the earliest [ns, CLOCK_MONOTONIC].
+            by: number of the session.
+        """
         latched_ns = self._shared.latch.stopped_ns
         self._note(workcell_entry(who, stop=False, latched_ns=latched_ns))  # first: a later stop is noted after it
         # What has been asked for since the mark has not been heard.
-        self._shared.latch.reset(time.monotonic_ns(), self._request_seen)
+        sent_ns = max(sent_ns, self._shared.record.asked.own_of_any_ns(by))
+        self._shared.latch.reset(time.monotonic_ns(), self._request_seen, sent_ns)
         self._cell.log("warning", "reset", by=who)
         for device in self._cell.devices.values():
             device.trouble = ""
@@ -105,35 +127,50 @@ class Stops:
         for device in self._cell.devices.values():
             self.look_at_inputs(device)  # as one that is still pressed, it stops the workcell again
 
-    def stop_node(self, node: Node, source: str) -> None:
+    def stop_node(self, node: Node, source: str, by: int = 0) -> None:
         """Stop a node and keep that; one whose driver is not there starts stopped.
+
+        Args:
+            node: which.
+            source: who asks for it, and why.
+            by: number of the session.
 
         Raises:
             OSError: EIO, its driver takes no messages: it will be stopped when it is started again.
         """
         now_ns = time.monotonic_ns()
-        self._nodes_stopped_ns |= dict.fromkeys(_channels(node), now_ns)
+        self._shared.record.asked.note(*self._parts(node), now_ns, by)
         try:
-            self._order(node, driver_verbs.NodeStop(*_parts(node), source, self._shared.latch.resets, now_ns))
+            self._order(node, driver_verbs.NodeStop(*_shown(node), source, self._shared.latch.resets, now_ns))
         finally:
             self._note(self._node_entry(node, source, stop=True))
             self._cell.log("warning", "emergency stop", node=node.name, source=source)
 
-    def stopped_since(self, instant_ns: int, node: Node | None = None) -> bool:
-        """Return whether a stop of the workcell, or of a node, has been asked for since an instant.
+    def stopped_since(self, instant_ns: int, by: int, node: Node | None = None) -> bool:
+        """Return whether somebody else has stopped what is to be reset since an instant.
 
         Args:
             instant_ns: [ns, CLOCK_MONOTONIC].
-            node: which; None: the workcell.
+            by: number of the session that is to reset it.
+            node: which; None: the workcell, and with it all nodes.
         """
-        if node is None:
-            return max(self._stopped_ns, self._shared.latch.stopped_ns) > instant_ns
-        return any(self._nodes_stopped_ns.get(channel, 0) > instant_ns for channel in _channels(node))
+        record = self._shared.record
+        record.look()
+        if node is not None:
+            return record.asked.latest_ns(*_masks(*self._parts(node)), by) > instant_ns
+        latched_ns = self._shared.latch.stopped_ns
+        if latched_ns > max(instant_ns, record.asked.own_of_any_ns(by)):
+            return True  # by a driver
+        return record.asked.latest_of_any_ns(by) > instant_ns
 
-    def reset_node(self, node: Node, who: str) -> None:
+    def reset_node(self, node: Node, who: str, sent_ns: int, by: int) -> None:
         """Clear the stop and the faults of a node.
 
         The reset is noted first: a stop that its driver takes after the reset, and notes by itself, is noted after it.
+
+        Args:
+            node: which.
+            who, sent_ns, by: as of ``reset_workcell``.
 
         Raises:
             OSError: EIO, its driver takes no messages.
@@ -144,7 +181,8 @@ class Stops:
         self._note(self._node_entry(node, who, stop=False))
         resets, now_ns = self._shared.latch.resets, time.monotonic_ns()
         try:
-            self._order(node, driver_verbs.NodeReset(*_parts(node), who, resets, now_ns))
+            sent_ns = max(sent_ns, record.asked.own_ns(*_masks(*self._parts(node)), by))
+            self._order(node, driver_verbs.NodeReset(*_shown(node), who, resets, now_ns, sent_ns))
         except OSError:
             for entry in before:
                 self._note(entry)
@@ -159,11 +197,14 @@ class Stops:
             self._shared.latch.ordered()
 
     def _node_entry(self, node: Node, source: str, *, stop: bool) -> dict[str, Any]:
+        (device, block), parts = self._parts(node)
+        return node_entry(node.name, device, block, parts, source, stop=stop)
+
+    def _parts(self, node: Node) -> tuple[tuple[str, str], list[tuple[int, int]]]:
+        """Return device and block of a node, and its parts."""
         block = self._cell.names.devices[node.device].blocks[node.block]
-        parts = [
-            part for c in node.channels for part in parts_of(c, node.bit, block.channels[c].width)
-        ]  # fmt: skip
-        return node_entry(node.name, node.device, block.name, parts, source, stop=stop)
+        parts = [part for c in node.channels for part in parts_of(c, node.bit, block.channels[c].width)]
+        return (node.device, block.name), parts
 
     def _note(self, entry: dict[str, Any]) -> None:
         try:
@@ -231,11 +272,14 @@ class Stops:
         self._pass_on_stops()
 
 
-def _parts(node: Node) -> tuple[int, list[int], int]:
+def _shown(node: Node) -> tuple[int, list[int], int]:
     """Return the block, the channels and the bit that a node shows."""
     return node.block, list(node.channels), node.bit
 
 
-def _channels(node: Node) -> list[tuple[str, int, int]]:
-    """Return the device, the block and each channel that a node shows."""
-    return [(node.device, node.block, channel) for channel in node.channels]
+def _masks(block: tuple[str, str], parts: list[tuple[int, int]]) -> tuple[tuple[str, str], dict[int, int]]:
+    """Return parts of a block as masks; see ``PartTimes``."""
+    masks: dict[int, int] = {}
+    for channel, bit in parts:
+        masks[channel] = masks.get(channel, 0) | 1 << bit
+    return block, masks

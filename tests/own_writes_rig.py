@@ -134,7 +134,7 @@ class World:
         self.latch = Latch(memoryview(mmap.mmap(latch, LATCH_SIZE)))
         self.markers = MarkerTable(memoryview(mmap.mmap(markers, TABLE_SIZE)))
         self.latch.daemon_alive(time.monotonic_ns())
-        self._fds = [latch, markers, journal, events]
+        self._fds, self.journal = [latch, markers, journal, events], journal
         self.runtime._scheduled_ns = time.monotonic_ns()
         self.runtime.looked_ns = time.monotonic_ns()
         self.page_fds = list(self.runtime.pages.fds)

@@ -82,7 +82,7 @@ from sioms.protocol.messages import MAX_PACKET, ClientVerb, HandleVerb, decode, 
 from sioms.protocol.records import BINARY_WRITE
 from sioms.protocol.stopfile import open_stop_request
 from sioms.sdk.blocks import AxisBlock
-from sioms.sdk.timestamps import Timestamps
+from sioms.timestamps import Timestamps
 from sioms.turns import Turns
 
 
@@ -170,6 +170,7 @@ class Cell:
         os.close(server.door._spare)
         shared.request.close()
         record._journal.close()
+        server.cell.timestamps.close()
         server.cell.loop.close()
         self.listener.close()
         self.server = self.record = None

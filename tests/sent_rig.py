@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import pytest
 
-from sioms.sdk.timestamps import Timestamps
+from sioms.timestamps import Timestamps
 
 
 class SentTimes:

@@ -204,7 +204,7 @@ class Gateway:
             held.until_ns = max(held.until_ns, stamp_ns + held.lease_ns)
         try:
             is_silent = packet == KEEPALIVE  # how old what acts is, the driver has to know exactly
-            if held.lease_ns and stamp_ns - held.told_ns > (held.lease_ns // TOLD if is_silent else 0):
+            if stamp_ns - held.told_ns > (held.lease_ns // TOLD if is_silent else 0):
                 held.told_ns = stamp_ns
                 held.node.send(verbs.Heard(stamp_ns).packed())
             if _verb(packet) == verbs.Heard.verb:
@@ -244,7 +244,7 @@ class Gateway:
                 return
             packet = verbs.Supervise(left_s).packed(number)
         if isinstance(message, verbs.Reset):
-            self._to_line(session, verbs.Said(stamp_ns).packed())
+            self._to_line(session, verbs.Said(max(1, stamp_ns)).packed())  # 0 would say nothing
         if isinstance(message, verbs.Journal):
             session.asks[number] = message.device
         if isinstance(message, verbs.Cancel) and self._cancelled(session, number, message.number):

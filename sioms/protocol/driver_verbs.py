@@ -108,7 +108,8 @@ class NodeStop(Message, on=TO_DRIVER, verb=DriverVerb.NODE_STOP, notice=True):
 class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):
     """Clear the stop and the faults of some channels; void when the workcell has been reset since.
 
-    ``at_ns`` is when it was sent: what clients have sent before to what was stopped is not taken any more.
+    ``at_ns`` is when it was sent: what clients have sent before to what was stopped is not taken any more. ``sent_ns``
+    is when somebody has asked the daemon for it, at the earliest: it undoes no stop that was asked for later.
     """
 
     block: Integer
@@ -117,6 +118,7 @@ class NodeReset(Message, on=TO_DRIVER, verb=DriverVerb.NODE_RESET, notice=True):
     source: Text
     resets: Integer
     at_ns: Integer
+    sent_ns: Integer
 
 
 class InUse(Message, on=TO_DRIVER, verb=DriverVerb.IN_USE, notice=True):

@@ -13,7 +13,8 @@ LATCH_SIZE = 4096
 _STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS, _RESET_AT, _ENDED = range(8)
 _TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
 _SEPARATE = 576
-"""Words that no steps look at: when the last stop was ended."""
+_ENDED_AT, _RESET_SENT = 0, 1
+"""Words that no steps look at: when the last stop was ended; when the last reset was sent."""
 
 
 class Latch:
@@ -28,7 +29,7 @@ class Latch:
     def __init__(self, buffer: memoryview) -> None:
         self._bytes = buffer
         self._words = buffer[:64].cast("Q")
-        self._separate = buffer[_SEPARATE : _SEPARATE + 8].cast("Q")
+        self._separate = buffer[_SEPARATE : _SEPARATE + 16].cast("Q")
 
     @property
     def stopped_ns(self) -> int:
@@ -53,7 +54,12 @@ class Latch:
     @property
     def ended_ns(self) -> int:
         """When that stop was ended [ns, CLOCK_MONOTONIC]; later resets may have ended none."""
-        return self._separate[0]
+        return self._separate[_ENDED_AT]
+
+    @property
+    def reset_sent_ns(self) -> int:
+        """When the last reset was sent, at the earliest [ns, CLOCK_MONOTONIC]: it ends no later stop."""
+        return self._separate[_RESET_SENT]
 
     @property
     def daemon_alive_ns(self) -> int:
@@ -91,16 +97,18 @@ class Latch:
         """Mark of the stop-request file that the last reset answered: no new request to who sees it only now."""
         return self._words[_ANSWERED], self._words[_ANSWERED_AT]
 
-    def reset(self, now_ns: int, request: tuple[int, int] = (0, 0)) -> None:
+    def reset(self, now_ns: int, request: tuple[int, int] = (0, 0), sent_ns: int | None = None) -> None:
         """Clear the latch (the daemon's, on behalf of somebody entitled).
 
         Args:
             now_ns: time of the reset: what clients have sent before it is not taken after it [ns, CLOCK_MONOTONIC].
             request: mark of the stop-request file that is thereby answered.
+            sent_ns: when it was sent, at the earliest [ns, CLOCK_MONOTONIC]; None: now.
         """
         self._words[_RESET_AT] = now_ns
+        self._separate[_RESET_SENT] = now_ns if sent_ns is None else sent_ns
         if self._words[_STOPPED]:
-            self._separate[0] = now_ns
+            self._separate[_ENDED_AT] = now_ns
             self._words[_ENDED] = self._words[_STOPPED]
         self._words[_ANSWERED], self._words[_ANSWERED_AT] = request  # before the latch opens
         self._words[_RESETS] += 1

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     Part: TypeAlias = tuple[str, str, int, int]
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
-NODE, WORKCELL, CHECKPOINT, PID, LATCHED = "node", "workcell", "checkpoint", "pid", "latched"
+NODE, WORKCELL, CHECKPOINT, PID, LATCHED, ASKED = "node", "workcell", "checkpoint", "pid", "latched", "asked"
 MOST_ENDED = 16
 """Stops of the workcell that are known to have been reset: a driver that notes one of them later does not stop anew."""
 MOST_PARTS = 1 << 20
@@ -40,16 +40,25 @@ _DAMAGE = (ValueError, TypeError, LookupError, ArithmeticError)
 
 
 def node_entry(
-    name: str, device: str, block: str, parts: Iterable[tuple[int, int]], source: str, *, stop: bool, pid: int = 0
-) -> dict[str, Any]:
+    name: str, device: str, block: str, parts: Iterable[tuple[int, int]], source: str, *, stop: bool, pid: int = 0,
+    at_ns: int = 0,
+) -> dict[str, Any]:  # fmt: skip
     """Return the entry of the stop or the reset of a node: its name, its parts (channel, bit), and who did it.
 
-    ``pid`` is that of the driver process in which it holds; 0: the daemon tells the driver.
+    ``pid`` is that of the driver process in which it holds; 0: the daemon tells the driver. ``at_ns`` is when a stop
+    was asked for [ns, CLOCK_MONOTONIC]; 0: unknown.
     """
     of_driver = {PID: pid} if pid else {}
+    of_driver |= {ASKED: at_ns} if at_ns else {}
     return {
         NODE: name, "device": device, "block": block, "parts": _packed(parts), "stop": stop, "by": source, **of_driver,
     }  # fmt: skip
+
+
+def asked_ns(entry: Mapping[str, Any], now_ns: int) -> int:
+    """Return when the stop of an entry was asked for, now at the latest [ns, CLOCK_MONOTONIC]; 0: unknown."""
+    at_ns = entry.get(ASKED, 0)
+    return min(at_ns, now_ns) if type(at_ns) is int else 0
 
 
 def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:

@@ -24,6 +24,7 @@ from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
 from sioms.protocol.verbs import Message
+from sioms.timestamps import Timestamps, receive
 from sioms.turns import Turns
 
 from .blocks import AnyBlock, AxisBlock
@@ -32,7 +33,6 @@ from .handles import LATER, UNKNOWN, Came, Handle, Quota
 from .parts import Service
 from .requests import ioctl
 from .stops import Reason, Stop
-from .timestamps import Timestamps, receive
 from .writing import concerned, take_plain, write
 
 OWNERS, READERS = 0, 1
@@ -143,7 +143,7 @@ class Attachments:
         )  # fmt: skip
         self.handles[number] = handle
         if self._service.stops.resets.count:  # its client may have used it for long already
-            handle.note_reset(0)
+            handle.note_reset(self._service.stops.resets.latest_ns(id(handle.block), dict.fromkeys(channels, -1), 0))
         if exclusive:
             self._owners |= dict.fromkeys((sock.fileno(), *([handle.pidfd] if handle.pidfd >= 0 else [])), handle)
         if lease_ns:
@@ -243,14 +243,12 @@ class Attachments:
         if handle.number not in self.handles:
             return  # that was the order
         try:
-            if isinstance(message, verbs.Ioctl) and message.request == Request.RESET:
-                self._refuse_late_reset(handle, message, came)
-            elif _acts(message) and self._is_stale(handle, number, message, came):
+            if _acts(message) and self._is_stale(handle, number, message, came):
                 handle.ahead = (0, [])
                 raise OSError(
                     errno.ECANCELED, f"{_what(message)} {handle.node}: sent before the last reset; send it again"
                 )
-            value = self._value(handle, number, message)
+            value = self._value(handle, number, message, came)
         except OSError as error:
             why = error.errno or errno.EIO, error.strerror or str(error)
             handle.refuse(number, *why)
@@ -268,19 +266,8 @@ class Attachments:
             came, ahead = handle.ahead_came, b"".join(handle.ahead[1])
         if came.resets == resets.count:
             return False
-        reset_ns = resets.latest_ns(handle.block, concerned(handle, message, ahead), handle.number)
+        reset_ns = resets.latest_ns(id(handle.block), concerned(handle, message, ahead), handle.number)
         return self._sent_ns(came) < reset_ns
-
-    def _refuse_late_reset(self, handle: Handle, message: verbs.Message, came: Came) -> None:
-        """Refuse a reset of what somebody else has stopped after it had been sent.
-
-        Raises:
-            OSError: EAGAIN.
-        """
-        asked_ns = self._service.stops.asked.latest_ns(handle.block, concerned(handle, message), handle.number)
-        if asked_ns and self._sent_ns(came) < asked_ns:
-            text = f"{_what(message)} {handle.node}: stopped after this was sent; see why, and reset again"
-            raise OSError(errno.EAGAIN, text)
 
     def _sent_ns(self, came: Came) -> int:
         """Return when a packet was sent [ns, CLOCK_MONOTONIC], or before."""
@@ -290,7 +277,7 @@ class Attachments:
         """Note a command, after its answer has been sent: a client does not wait for that."""
         self._journal.note(Note.COMMAND, handle.came_ns, handle.node, handle.who, packet, errno_, why)
 
-    def _value(self, handle: Handle, number: int, message: verbs.Message) -> Any:
+    def _value(self, handle: Handle, number: int, message: verbs.Message, came: Came) -> Any:
         match message:
             case verbs.Write(flags, timeout_s, records):
                 self._service.effects.note()
@@ -300,7 +287,8 @@ class Attachments:
             case verbs.Ioctl(request, argument, timeout_s):
                 if request not in REQUESTS or not REQUESTS[request][2]:
                     self._service.effects.note()
-                return ioctl(self._service, handle, number, request, argument, timeout_s)
+                sent_ns = self._sent_ns(came) if request == Request.RESET else 0
+                return ioctl(self._service, handle, number, request, argument, timeout_s, sent_ns)
             case verbs.Subscribe(every):
                 self._subscribe(handle, every)
                 return None
@@ -359,10 +347,11 @@ class Attachments:
 
 
 def _acts(message: verbs.Message) -> bool:
-    """Return whether a message does anything but look, wait, or stop."""
+    """Return whether a message does anything but look, wait, stop, or reset what has been stopped."""
     if isinstance(message, verbs.Ioctl):
         stops = message.request in (Request.STOP, Request.EMERGENCY_STOP, Request.FLUSH, Request.CANCEL_WAITS)
-        return not stops and not (message.request in REQUESTS and REQUESTS[message.request][2])
+        judged_there = message.request == Request.RESET
+        return not stops and not judged_there and not (message.request in REQUESTS and REQUESTS[message.request][2])
     return isinstance(message, verbs.Write)
 
 

@@ -27,11 +27,11 @@ from sioms.protocol.flags import Access, Right
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import refusal, reply
 from sioms.protocol.text import shown
+from sioms.timestamps import pending_bytes
 
 from .blocks import AnyBlock
 from .effects import Effects
 from .exchange import HookError
-from .timestamps import pending_bytes
 
 LOOKS_A_MS = 16
 """Waits of each user that are looked at, for every millisecond of a tick's period: some 20 us, 100 where all are

@@ -82,6 +82,8 @@ class Orders:
             stop(block, order.channels, order.bit, order.source, order.at_ns)
         elif not is_over:
             try:
-                self._stops.reset_node(block, order.channels, order.bit, "reset", order.at_ns)
+                self._stops.reset_node(
+                    block, order.channels, order.bit, f"reset by {order.source}", order.at_ns, order.sent_ns
+                )
             except (OSError, CommandError) as error:
                 self._log("warning", str(error))

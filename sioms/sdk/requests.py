@@ -37,9 +37,10 @@ def _refuse(errno_: int, text: str) -> OSError:
 
 
 def ioctl(
-    service: Service, handle: Handle, number: int, request_number: int, argument: Any, timeout_s: float | None
-) -> Any:
-    """Carry out a request; see ``Request``.
+    service: Service, handle: Handle, number: int, request_number: int, argument: Any, timeout_s: float | None,
+    sent_ns: int = 0,
+) -> Any:  # fmt: skip
+    """Carry out a request; see ``Request``. A RESET has to say when it was sent [ns, CLOCK_MONOTONIC].
 
     Returns:
         A msgpack-able value, or LATER.
@@ -68,7 +69,7 @@ def ioctl(
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as instant; want a time in ns, or none for now")
             if argument is None and handle.passed_on:  # of a client that was told the time last then, by a gateway
                 argument = handle.heard_ns
-            return service.stops.reset_by(handle, what, argument, service.loop.heed)
+            return service.stops.reset_by(handle, what, sent_ns, argument, service.loop.heed)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}
             return service.waits.end_where(

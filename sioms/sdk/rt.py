@@ -16,8 +16,9 @@ import time
 from collections.abc import Callable
 from contextlib import suppress
 
+from sioms.timestamps import TFD_CLOEXEC, TFD_NONBLOCK, TFD_TIMER_ABSTIME, Itimerspec
+
 _libc = ctypes.CDLL(None, use_errno=True)
-_TFD_CLOEXEC, _TFD_NONBLOCK, _TFD_TIMER_ABSTIME, _TFD_TIMER_CANCEL_ON_SET = 0o2000000, 0o4000, 1, 2
 _MCL_CURRENT, _MCL_FUTURE, _MCL_ONFAULT = 1, 2, 4
 _IN_MODIFY, _IN_ATTRIB = 0x02, 0x04
 _PR_SET_NAME, _PR_SET_TIMERSLACK = 15, 29
@@ -27,14 +28,6 @@ RESTLESS_S = 0.2
 """Longest that a real-time process may work without waiting for anything [s]; ticks take milliseconds."""
 
 
-class _Timespec(ctypes.Structure):
-    _fields_ = (("sec", ctypes.c_long), ("nsec", ctypes.c_long))
-
-
-class _Itimerspec(ctypes.Structure):
-    _fields_ = (("interval", _Timespec), ("value", _Timespec))
-
-
 class TimerFd:
     """A timer as a descriptor (timerfd_create(2)), on CLOCK_MONOTONIC.
 
@@ -42,10 +35,10 @@ class TimerFd:
     """
 
     def __init__(self) -> None:
-        self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, _TFD_CLOEXEC | _TFD_NONBLOCK)
+        self.fd: int = _libc.timerfd_create(time.CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK)
         if self.fd < 0:
             raise OSError(ctypes.get_errno(), "create timer: timerfd_create failed")
-        self._spec = _Itimerspec()
+        self._spec = Itimerspec()
         self._pointer = ctypes.byref(self._spec)
 
     def set(self, first_ns: int, period_ns: int = 0) -> None:
@@ -53,7 +46,7 @@ class TimerFd:
         spec = self._spec
         spec.value.sec, spec.value.nsec = divmod(first_ns, 1_000_000_000)
         spec.interval.sec, spec.interval.nsec = divmod(period_ns, 1_000_000_000)
-        if _libc.timerfd_settime(self.fd, _TFD_TIMER_ABSTIME, self._pointer, None):
+        if _libc.timerfd_settime(self.fd, TFD_TIMER_ABSTIME, self._pointer, None):
             raise OSError(ctypes.get_errno(), "set timer: timerfd_settime failed")
 
     def expirations(self) -> int:
@@ -62,38 +55,6 @@ class TimerFd:
             return int.from_bytes(os.read(self.fd, 8), "little")
         except BlockingIOError:
             return 0
-
-    def close(self) -> None:
-        """Release the descriptor."""
-        os.close(self.fd)
-
-
-class ClockChanges:
-    """Tells whether CLOCK_REALTIME has been set: what makes it jump, not what makes it faster (timerfd_create(2)).
-
-    Raises:
-        OSError: there are no descriptors left.
-
-    Concurrency: one thread.
-    """
-
-    def __init__(self) -> None:
-        self.fd: int = _libc.timerfd_create(time.CLOCK_REALTIME, _TFD_CLOEXEC | _TFD_NONBLOCK)
-        never = _Itimerspec(value=_Timespec(sec=1 << 40))
-        how = _TFD_TIMER_ABSTIME | _TFD_TIMER_CANCEL_ON_SET
-        if self.fd < 0 or _libc.timerfd_settime(self.fd, how, ctypes.byref(never), None):
-            raise OSError(ctypes.get_errno(), "watch the clock: timerfd failed")
-
-    def found(self) -> bool:
-        """Return whether it has been set since the last call."""
-        try:
-            os.read(self.fd, 8)
-        except BlockingIOError:
-            return False
-        except OSError as error:
-            if error.errno != errno.ECANCELED:
-                raise
-        return True
 
     def close(self) -> None:
         """Release the descriptor."""

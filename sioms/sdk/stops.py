@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sioms.motion import CommandError, EventKind
+from sioms.part_times import PartTimes
 from sioms.protocol.driver_verbs import AlarmChanged, Stopped
 from sioms.protocol.flags import PageState, Reaction, Severity
 from sioms.protocol.journal import JournalWriter, Note
@@ -31,7 +32,6 @@ from .engine import Engine
 from .handles import Handle, Waits
 from .outputs import WHOLE, Outputs, safe_of
 from .pages import Pages
-from .part_times import PartTimes
 
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
@@ -136,7 +136,7 @@ class Stops:
         self.look()
         if fresh:
             self._note(workcell_entry(source, stop=True, latched_ns=now_ns))
-            self._request.request(time.monotonic_ns(), os.getpid(), source)  # wakes the other drivers
+            self._request.request(now_ns, os.getpid(), source)  # wakes the other drivers
             self._tell(Stopped(source))
 
     @property
@@ -201,11 +201,19 @@ class Stops:
         if not stopped_ns and (self.stopped or is_reset):
             self._effects.note()
             self.stopped = False
-            self.latched_outputs.clear()
             self._events.note(Note.RESET, time.monotonic_ns(), "", [])
             for block in self._blocks:
-                if isinstance(block, AxisBlock):
-                    self._reset_axes(block, range(block.n))
+                self._reset_with_workcell(block)
+
+    def _reset_with_workcell(self, block: AnyBlock) -> None:
+        """Clear the stops of a block, but for those that were asked for after the reset of the workcell was."""
+        stopped = self._stopped_of(block, range(block.n), -1)
+        younger = self.asked.since(id(block), self._latch.reset_sent_ns)
+        kept = [part for part in stopped if part in younger]
+        if kept:
+            self._note_still(block, kept, "a stop that came during the reset of the workcell")
+        everything = [(axis, 0) for axis in range(block.n)] if isinstance(block, AxisBlock) else stopped
+        self._clear(block, [part for part in everything if part not in kept])
 
     def _note_workcell_reset(self, seen_stop_ns: int) -> bool:
         """Note that the workcell has been reset; return whether that has ended a stop that was not seen."""
@@ -224,7 +232,7 @@ class Stops:
         """Note when parts of a block, that are stopped or in fault, were reset; see ``PartTimes.note``."""
         if not stopped:
             return
-        self.resets.note(block, stopped, at_ns, by)
+        self.resets.note(id(block), stopped, at_ns, by)
         reset = {channel for channel, _ in stopped}
         for handle in self._handles.values():
             if handle.block is block and not reset.isdisjoint(handle.axes) and handle.number != by:
@@ -362,7 +370,7 @@ class Stops:
             by: number of the handle that asks for it; 0: none.
         """
         parts = [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
-        self.asked.note(block, parts, time.monotonic_ns() if at_ns is None else at_ns, by)
+        self.asked.note(id(block), parts, time.monotonic_ns() if at_ns is None else at_ns, by)
         if not isinstance(block, AxisBlock):
             self.latched_outputs |= {(id(block), *part): source for part in parts}
         self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
@@ -378,25 +386,31 @@ class Stops:
         self._clear(block, stopped)
 
     def reset_node(
-        self, block: AnyBlock, channels: Any, bit: int, what: str, at_ns: int, until_ns: int | None = None, by: int = 0
+        self, block: AnyBlock, channels: Any, bit: int, what: str, at_ns: int, sent_ns: int,
+        until_ns: int | None = None, by: int = 0,
     ) -> None:  # fmt: skip
         """Clear the latched stop and faults of some channels, or the stop of one bit of them.
 
         Args:
             block, channels, bit: what is reset.
             what: in words.
-            at_ns: when that was asked for [ns, CLOCK_MONOTONIC].
-            until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
-            by: number of the handle that asks for it; 0: none.
+            at_ns: when it is done: what was sent before is not taken after it [ns, CLOCK_MONOTONIC].
+            sent_ns, until_ns, by: as of ``check_reset``.
 
         Raises:
-            OSError: as ``check_reset``.
+            OSError: as ``check_reset``; of what is stopped it is noted that it is so still.
         """
-        self.check_reset(block, channels, what, until_ns)
+        stopped = self._stopped_of(block, channels, bit)
+        try:
+            self.check_reset(block, channels, bit, what, sent_ns, until_ns, by)
+        except OSError:
+            if stopped:
+                self._note_still(block, stopped, "a stop that came during a reset")
+            raise
         self._effects.note()
         self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
         parts = [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
-        self._note_reset(block, self._stopped_of(block, channels, bit), at_ns, by)
+        self._note_reset(block, stopped, at_ns, by)
         self._clear(block, parts)
 
     def _clear(self, block: AnyBlock, parts: Iterable[tuple[int, int]]) -> None:
@@ -407,21 +421,37 @@ class Stops:
         for part in parts:
             self.latched_outputs.pop((id(block), *part), None)
 
-    def check_reset(self, block: AnyBlock, channels: Any, what: str, until_ns: int | None) -> None:
-        """Refuse a reset of some channels that cannot be.
+    def check_reset(
+        self, block: AnyBlock, channels: Any, bit: int, what: str, sent_ns: int, until_ns: int | None = None,
+        by: int = 0,
+    ) -> None:  # fmt: skip
+        """Refuse a reset of some channels, or of one bit of them, that cannot be.
+
+        Args:
+            block, channels, bit: what is to be reset.
+            what: in words.
+            sent_ns: when that was sent, or before [ns, CLOCK_MONOTONIC].
+            until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
+            by: number of the handle that asks for it; 0: none.
 
         Raises:
-            OSError: EPERM, the whole workcell is stopped; EAGAIN, they were stopped at until_ns or later.
+            OSError: EPERM, the whole workcell is stopped; EAGAIN, somebody else has stopped one of them since it was
+                sent, or it was stopped at until_ns or later.
         """
         if self.stopped:
             raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
+        masks = dict.fromkeys(map(int, channels), 1 << bit if bit >= 0 else -1)
+        if sent_ns < self.asked.latest_ns(id(block), masks, by):
+            raise OSError(errno.EAGAIN, f"{what}: stopped after this was sent; see why, and reset again")
         if isinstance(block, AxisBlock) and until_ns is not None:
             try:
                 block.bank.check_reset(channels, until_ns)
             except CommandError as error:
                 raise OSError(error.errno, f"{what}: {error}") from None
 
-    def reset_by(self, handle: Handle, what: str, until_ns: int | None, heed: Callable[[], None]) -> None:
+    def reset_by(
+        self, handle: Handle, what: str, sent_ns: int, until_ns: int | None, heed: Callable[[], None]
+    ) -> None:  # fmt: skip
         """Reset, on behalf of a client, the node that it holds or watches.
 
         The reset is noted before it is done: a stop that the daemon sends at the same time is either heard before it is
@@ -430,21 +460,17 @@ class Stops:
         Args:
             handle: of the client.
             what: in words.
-            until_ns: see ``Bank.check_reset``; None: whatever there is now is reset.
+            sent_ns, until_ns: as of ``check_reset``.
             heed: obeys what the daemon has sent.
 
         Raises:
             OSError: as ``check_reset``.
         """
-        self.check_reset(handle.block, handle.channels, what, until_ns)
+        node = handle.block, handle.axes, handle.bit
+        self.check_reset(*node, what, sent_ns, until_ns, handle.number)
         self.note_node(handle, handle.who, stop=False)
         heed()
-        try:
-            now_ns = time.monotonic_ns()
-            self.reset_node(handle.block, handle.channels, handle.bit, what, now_ns, until_ns, handle.number)
-        except OSError:
-            self.note_node(handle, f"a stop that came during a reset by {handle.who}", stop=True)
-            raise
+        self.reset_node(*node, what, time.monotonic_ns(), sent_ns, until_ns, handle.number)
 
     def note_node(self, handle: Handle, source: str, *, stop: bool) -> None:
         """Note that a client has stopped or reset the node that it holds or watches."""
@@ -452,7 +478,15 @@ class Stops:
         parts = [part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)]
         what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
         self._log("warning", f"{what} by {handle.who}")
-        self._note(node_entry(handle.node, self._device, spec.name, parts, source, stop=stop, pid=os.getpid()))
+        at_ns = time.monotonic_ns() if stop else 0
+        entry = node_entry(handle.node, self._device, spec.name, parts, source, stop=stop, pid=os.getpid(), at_ns=at_ns)
+        self._note(entry)
+
+    def _note_still(self, block: AnyBlock, parts: Iterable[tuple[int, int]], source: str) -> None:
+        """Note that parts of a block are stopped still: somebody has noted their reset, which has not been done."""
+        name, spec = self._name(block), block.spec
+        self._log("warning", f"{name} stays stopped: {source}")
+        self._note(node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid()))
 
     def stop_by_alarm(self, reaction: Reaction, block: AnyBlock, rule: Rule, why: str) -> None:
         """Stop what an alarm is to stop: the node that it watches, the whole device, or the workcell."""
@@ -469,7 +503,10 @@ class Stops:
             spec = each.spec
             parts = [part for c in channels for part in parts_of(int(c), bit, spec.channels[c].width)]
             self._log("warning", f"emergency stop of {name} by {source}")
-            self._note(node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid()))
+            at_ns = time.monotonic_ns()
+            self._note(
+                node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid(), at_ns=at_ns)
+            )
 
     def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:
         """Stop what was stopped when the process before this one ended, before anything can move.

@@ -195,13 +195,19 @@ def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
             axis.command(velocity=0.01)  # who knows of the reset is not refused
 
 
-@pytest.mark.parametrize("way", ["of the cell", "of the node", "of the workcell"])
+@pytest.mark.parametrize("again", ["by the daemon", "on a handle"])
+@pytest.mark.parametrize("way", ["of the cell", "of the node", "by a reader", "of the workcell"])
 def test_a_reset_that_was_under_way_leaves_a_later_stop(
-    daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str
+    daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str, again: str
 ) -> None:
-    with behind_a_relay(gate) as (relay, far, axis), cell.open("mod1.readonly") as seen:
+    with (
+        behind_a_relay(gate) as (relay, far, axis),
+        far.open("mod1.readonly") as reader,
+        cell.open("mod1.readonly") as seen,
+    ):
         reset = {
-            "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "of the workcell": lambda: far.reset()
+            "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "by a reader": reader.reset,
+            "of the workcell": lambda: far.reset(),
         }[way]  # fmt: skip
         name = "" if way == "of the workcell" else "mod1"
         cell.emergency_stop(name)
@@ -209,7 +215,10 @@ def test_a_reset_that_was_under_way_leaves_a_later_stop(
         relay.treat(stalled=True)
         resetting = Waiting(reset)
         time.sleep(0.1)
-        cell.emergency_stop(name)
+        if again == "on a handle":
+            seen.emergency_stop()
+        else:
+            cell.emergency_stop(name)
         relay.treat()
         assert resetting.errno() == errno.EAGAIN
         assert seen.read().status[0] & AxisStatus.EMERGENCY_STOP

@@ -207,7 +207,7 @@ def _axis_acts(
         if not by_daemon:
             owner.ioctl(Request.RESET, None, done)
         elif not world.latch.stopped_ns:
-            world.order(DriverVerb.NODE_RESET, 0, [number], -1, "somebody", world.latch.resets, CLOCK())
+            world.order(DriverVerb.NODE_RESET, 0, [number], -1, "somebody", world.latch.resets, CLOCK(), CLOCK())
             done(None)
 
     def stop_all() -> None:

@@ -26,9 +26,8 @@ SHOWN = {
     "sioms/reconcile/live/watch.py": "since when an axis drifts, as text",
     "sioms/reconcile/report/watch.py": "since when an axis drifts, as text",
     "sioms/recording": "the names and the beginning of recordings",
-    "sioms/sdk/rt.py": "whether the clock has been set",
-    "sioms/sdk/timestamps.py": "the age of packets; where the clock has been set, they are refused",
     "sioms/sdk/stops.py": "since when something has been stopped",
+    "sioms/timestamps.py": "the age of packets; where the clock has been set, they are refused",
     "tools": "what a person reads",
 }
 """Files and folders that look at the wall clock, and what for: none of it decides when something happens."""

@@ -94,11 +94,12 @@ class Workcell:
         self.cell.names, self.cell.devices = NameTable(INFOS, BITS), {"io0": self.device}  # type: ignore[dict-item]
         stops: Any = SimpleNamespace(
             hear_request=str,
-            stop_for=lambda pid, source: self.done.append("stop"),
+            stop_for=lambda pid, source, by: self.done.append("stop"),
             stop_workcell=lambda source: self.done.append("stop"),
-            reset_workcell=lambda who: self.done.append("reset"),
-            stop_node=lambda node, source: self.done.append(f"stop {node.name}"),
-            reset_node=lambda node, who: self.done.append(f"reset {node.name}"),
+            reset_workcell=lambda who, sent_ns, by: self.done.append("reset"),
+            stop_node=lambda node, source, by: self.done.append(f"stop {node.name}"),
+            stopped_since=lambda *_: False,
+            reset_node=lambda node, who, sent_ns, by: self.done.append(f"reset {node.name}"),
         )
         self.alarms = AlarmKeeper(self.cell, stops, "/nowhere/alarms")
         self.clients = Clients(self.cell)
@@ -162,6 +163,7 @@ class Workcell:
                 session.leash.cut()
         for each in (*self.ends.values(), *(s.sock for s in self.sessions.values())):
             each.close()
+        self.requests.close()
         os.close(self.device.page_fds[0])
         os.close(self.cell.shared.journal.fd)
         self.loop.close()

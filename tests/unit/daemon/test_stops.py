@@ -12,6 +12,7 @@ import pytest
 from sioms.daemon.cell import Cell
 from sioms.daemon.log import Log
 from sioms.daemon.stops import Stops
+from sioms.part_times import PartTimes
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.stopfile import SOMEBODY, StopRequest
 
@@ -27,7 +28,7 @@ class Rig:
         self.latch = Latch(memoryview(bytearray(LATCH_SIZE)))
         self.noted: list[str] = []
         state = SimpleNamespace(workcell="")
-        record = SimpleNamespace(look=lambda: None, state=state, note=self._note, path="stops")
+        record = SimpleNamespace(look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes())
         shared: Any = SimpleNamespace(latch=self.latch, request=self.request, record=record)
         cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
         self.cell, self.stops, self._state = cell, Stops(cell), state

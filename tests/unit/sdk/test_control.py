@@ -17,7 +17,7 @@ def _pair() -> tuple[socket.socket, Control]:
 
 def test_orders_overtake_and_the_rest_keeps_its_order_up_to_the_end_of_the_daemon() -> None:
     daemon, control = _pair()
-    stop, reset = NodeStop(0, [0], -1, "an operator", 3, 8), NodeReset(0, [0], -1, "an operator", 3, 9)
+    stop, reset = NodeStop(0, [0], -1, "an operator", 3, 8), NodeReset(0, [0], -1, "an operator", 3, 9, 9)
     for message in (InUse(True), stop, InUse(False), reset, Shutdown()):
         daemon.send(message.packed())
     daemon.close()

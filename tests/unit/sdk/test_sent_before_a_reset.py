@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import os
 import random
 from collections.abc import Iterator
 from typing import Any
@@ -15,6 +16,7 @@ from sioms.drivers.sim.io import SimIo
 from sioms.protocol.driver_verbs import DriverVerb
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.records import AXIS_WRITE, WRITE, WRITE_STRUCT
+from sioms.protocol.stopjournal import StopJournal, node_entry, parts_of, replay
 from sioms.protocol.verbs import Heard, Part, Write
 
 AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "motor": {"mass": 1.0}, "force_max": 60.0}
@@ -83,7 +85,8 @@ class Sender:
 
 def _order(world: World, verb: DriverVerb, channels: list[int], bit: int = -1) -> None:
     CLOCK.now_ns += LATER_NS
-    world.order(verb, 0, channels, bit, "eva", world.latch.resets, CLOCK())
+    sent = [CLOCK()] * (verb == DriverVerb.NODE_RESET)
+    world.order(verb, 0, channels, bit, "eva", world.latch.resets, CLOCK(), *sent)
 
 
 def _stop_and_reset(world: World, channels: list[int], bit: int = -1) -> None:
@@ -156,6 +159,78 @@ def test_an_output_that_was_stopped_after_its_reset_had_been_sent_stays_so(port:
     _order(port, DriverVerb.NODE_STOP, [0], bit=3)
     owner.set_bits(0b1000, 0b1000)
     assert owner.served() == [errno.EAGAIN, errno.EPERM]
+
+
+def test_a_reset_leaves_a_stop_that_the_driver_hears_of_while_it_resets(
+    axes: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    looks, heed = [0], axes.runtime.heed
+
+    def late() -> None:
+        looks[0] += 1
+        if looks[0] == 3:  # after the look before it is served
+            _order(axes, DriverVerb.NODE_STOP, [0])
+        heed()
+
+    owner.reset()
+    monkeypatch.setattr(axes.runtime, "heed", late)
+    assert owner.served() == [errno.EAGAIN]
+    assert axes.runtime.blocks[0].bank.is_latched(0)  # type: ignore[attr-defined]
+
+
+def test_ones_own_stop_hides_none_that_another_has_asked_for_before(axes: World) -> None:
+    """Both lay there: the reset was sent before the other's stop, which is served first."""
+    eager, other = (Sender(axes, axes.open(0, [0], exclusive=False)) for _ in range(2))
+    eager.post(eager.client.node._ioctl(Request.EMERGENCY_STOP, None, None))
+    eager.reset()
+    other.post(other.client.node._ioctl(Request.EMERGENCY_STOP, None, None))
+    assert other.served() == [None]
+    assert eager.served() == [None, errno.EAGAIN]
+    eager.reset()
+    assert eager.served()[2:] == [None]
+
+
+@pytest.mark.parametrize("bit", [-1, 3])
+def test_a_reset_by_the_daemon_undoes_no_stop_that_was_asked_for_on_a_handle_since(port: World, bit: int) -> None:
+    sent_ns = CLOCK()
+    owner = Sender(port, port.open(0, [0], exclusive=True, bit=bit))
+    owner.post(owner.client.node._ioctl(Request.EMERGENCY_STOP, None, None))
+    assert owner.served() == [None]
+    parts = parts_of(0, bit, 8)
+    journal = StopJournal(os.dup(port.journal))
+    journal.append(node_entry("io0", "dev", port.runtime.blocks[0].spec.name, parts, "eva", stop=False), 0.0)
+    journal.close()  # as the daemon does first
+    by_eva = (DriverVerb.NODE_RESET, 0, [0], bit, "eva", port.latch.resets, CLOCK())
+    port.order(*by_eva, sent_ns)
+    port.runtime.heed()
+    owner.set_bits(1, 0)
+    assert owner.served() == [None, errno.EPERM]
+    noted = replay(os.pread(port.journal, 1 << 16, 0), 0, 0.0)
+    assert {part[2:] for part in noted.parts} == {*parts}, "also after the end of its process"
+    port.order(*by_eva, CLOCK())
+    port.runtime.heed()
+    owner.set_bits(1, 0)
+    assert owner.served()[2:] == [None]
+
+
+def test_a_reset_of_the_workcell_undoes_no_stop_of_a_node_that_was_asked_for_since(axes: World) -> None:
+    axes.latch.stop(CLOCK(), "eva")
+    axes.runtime.heed()
+    CLOCK.now_ns += LATER_NS
+    sent_ns = CLOCK()
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    beside = Sender(axes, axes.open(0, [1], exclusive=False))
+    beside.post(beside.client.node._ioctl(Request.EMERGENCY_STOP, None, None))
+    assert beside.served() == [None]
+    axes.latch.reset(CLOCK(), sent_ns=sent_ns)
+    owner.jog(1)
+    owner.jog(0)
+    assert owner.served() == [errno.EPERM, None]
+    CLOCK.now_ns += LATER_NS
+    axes.latch.reset(CLOCK())
+    owner.jog(1)
+    assert owner.served()[2:] == [None]
 
 
 def test_two_resets_at_once_are_both_done(axes: World) -> None:
@@ -276,6 +351,25 @@ def test_a_client_that_the_driver_hears_of_only_after_the_reset_is_judged_too(ax
     axes.open(0, [0], exclusive=True, early=act)
     early[0].jog()
     assert early[0].served() == [errno.ECANCELED, None]
+
+
+def test_of_a_client_behind_a_gateway_that_it_hears_of_only_then_too(axes: World) -> None:
+    """What such a client sends may be under way when the driver hears of it, too."""
+    before_ns = CLOCK()
+
+    def act(_: Client) -> None:
+        axes.latch.stop(CLOCK(), "eva")
+        CLOCK.now_ns += LATER_NS
+        axes.latch.reset(CLOCK())
+        axes.runtime.heed()
+
+    client = axes.open(0, [0], exclusive=True, early=act)
+    early = Sender(axes, client)
+    client.channel._sock.send(Heard(before_ns).packed())
+    early.jog()
+    client.channel._sock.send(Heard(CLOCK()).packed())
+    early.jog()
+    assert early.served() == [errno.ECANCELED, None]
 
 
 def test_a_reset_that_is_seen_while_a_packet_is_being_served_is_not_missed(

@@ -10,8 +10,7 @@ from collections.abc import Iterator
 import pytest
 
 from sioms.descriptors import enable_timestamps
-from sioms.sdk.rt import ClockChanges
-from sioms.sdk.timestamps import Timestamps, pending_bytes, receive
+from sioms.timestamps import ClockChanges, Timestamps, pending_bytes, receive
 
 Pair = tuple[socket.socket, socket.socket]
 
@@ -57,16 +56,43 @@ def test_a_packet_without_timestamp_is_as_old_as_can_be(timestamps: Timestamps) 
     assert packet == b"x" and timestamps.monotonic_ns(timestamp_ns) == 0
 
 
-def test_what_lies_there_when_the_clock_is_set_is_old(
+@pytest.mark.parametrize("by_ns", [-3_600_000_000_000, -2_000_000, 2_000_000, 3_600_000_000_000])
+def test_a_clock_that_is_set_makes_nothing_younger_and_little_older(
+    pair: Pair, timestamps: Timestamps, monkeypatch: pytest.MonkeyPatch, by_ns: int
+) -> None:
+    """A test must not set the clock of its machine: what is sent afterwards has the stamp that it would have then."""
+    ours, theirs = pair
+
+    def stamp() -> tuple[int, int]:
+        ours.send(b"x")
+        return time.monotonic_ns(), receive(theirs, 10)[1]
+
+    before_ns, old = stamp()
+    real = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: real() + by_ns)
+    monkeypatch.setattr(ClockChanges, "found", lambda _: True)
+    timestamps.look_at_clock()
+    monkeypatch.setattr(ClockChanges, "found", lambda _: False)
+    after_ns, new = stamp()
+    assert timestamps.monotonic_ns(old) <= before_ns
+    came_out_ns = timestamps.monotonic_ns(new + by_ns)
+    assert after_ns - max(0, -by_ns) - 1_000_000 < came_out_ns <= after_ns
+    monkeypatch.setattr("sioms.timestamps._DOUBT_NS", 0)
+    assert after_ns - 1_000_000 < timestamps.monotonic_ns(new + by_ns) <= after_ns, "seconds later"
+
+
+def test_a_clock_that_is_set_all_the_time_leaves_resets_possible(
     pair: Pair, timestamps: Timestamps, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     ours, theirs = pair
-    ours.send(b"x")
-    _, timestamp_ns = receive(theirs, 10)
-    monkeypatch.setattr(ClockChanges, "found", lambda _: True)  # a test must not set the clock of its machine
-    timestamps.look_at_clock()
-    monkeypatch.undo()
-    assert timestamps.monotonic_ns(timestamp_ns) == 0, "it may have been stamped by the clock as it was before"
+    real = time.time_ns
+    for by_ns in range(0, 20_000_000, 1_000_000):
+        monkeypatch.setattr(time, "time_ns", lambda by_ns=by_ns: real() + by_ns)
+        stopped_ns = time.monotonic_ns()
+        time.sleep(0.001)
+        ours.send(b"x")
+        _, timestamp_ns = receive(theirs, 10)
+        assert timestamps.monotonic_ns(timestamp_ns + by_ns) > stopped_ns
 
 
 def test_no_packet_is_from_the_future(timestamps: Timestamps) -> None:
