@@ -221,10 +221,13 @@ class ServoUnit(AxesUnit):
         yield from self._aim(self._count(action.acceleration_max * self._rate), self._count(speed * self._speed), goal)
 
     def start_velocity(self, axis: int, velocity: float, action: DriveAction) -> Steps:
-        """Set velocity and profile at once."""
+        """Set the profile, then the velocity: of the two in one message the servo may take the velocity first."""
         yield from self._switch_on()
         wanted = round(velocity * self._speed * math.copysign(1, self._per_unit))
-        yield from self._run(wanted, action.acceleration_max)
+        rate = self._count(action.acceleration_max * self._rate), 4
+        if self._set.get(PROFILE_ACCELERATION) != rate:
+            yield from self._write(PROFILE_ACCELERATION, *rate)
+        yield from self._write(GOAL_VELOCITY, wanted, 4)
 
     def start_force(self, axis: int, force: float, action: DriveAction) -> Steps:
         """Set the current."""
@@ -260,7 +263,11 @@ class ServoUnit(AxesUnit):
     def _rest(self) -> Steps:
         """Come to rest and stay there, by the goals of the mode."""
         if self._axis.mode == "velocity":
-            yield from self._run(0, self.bank.settings[0].acceleration_max)
+            rate = self._count(self.bank.settings[0].acceleration_max * self._rate), 4
+            slow = self._set.get(PROFILE_ACCELERATION) != rate
+            yield from self._write_all(GOAL_VELOCITY, [(0, 4), rate], repeatable=True)
+            if slow:  # it may brake with the profile of before
+                yield from self._write(GOAL_VELOCITY, 0, 4, repeatable=True)
         elif self._axis.mode == "current":
             yield from self._write(GOAL_CURRENT, 0, 2, repeatable=True)
         else:
@@ -284,10 +291,6 @@ class ServoUnit(AxesUnit):
         """Write profile and goal at once, so that no goal goes without its limits."""
         values = [(acceleration, 4), (velocity, 4), (goal, 4)]
         yield from self._write_all(PROFILE_ACCELERATION, values, repeatable=repeatable)
-
-    def _run(self, velocity: int, acceleration: float) -> Steps:
-        values = [(velocity, 4), (self._count(acceleration * self._rate), 4)]
-        yield from self._write_all(GOAL_VELOCITY, values, repeatable=velocity == 0)
 
     def _switch_on(self) -> Steps:
         """Switch the torque on, unless it is; no goal of before may be taken up, in whatever mode it was left."""

@@ -307,13 +307,19 @@ class TmclUnit(AxesUnit):
         yield from self._ask(self._module.exchange(op, 0, self._motors[axis], scale.speed(velocity)))
 
     def halt(self, axis: int, *, fastest: bool) -> Steps:
-        """Stop a motor: MST brakes with the ramp's acceleration, and there is nothing faster; a search ends first."""
+        """Stop a motor: MST brakes with the ramp's acceleration, and there is nothing faster; a search ends first.
+
+        The ramp may be a slow one that a command has set: then the motor is told that of the axis while it brakes.
+        """
         motor = self._motors[axis]
         if self._homes[axis]:
             self._homes[axis] = False
             with suppress(DeviceError):  # the stop must go out all the same
                 yield from self._ask(self._module.exchange(Op.RFS, 1, motor), search=True, repeatable=True)
         yield from self._ask(self._module.exchange(Op.MST, 0, motor), search=True)
+        hardest = self._scales[axis].acceleration(self._settings.axis[axis].acceleration_max)
+        if self._ramps.get((axis, Axis.MAX_ACCELERATION), hardest) < hardest:
+            yield from self._ramp(axis, Axis.MAX_ACCELERATION, hardest)
 
     def home(self, axis: int) -> Steps:
         """Begin the module's reference search."""

@@ -81,7 +81,7 @@ class Loop(Record):
 
     Law: gains, ``force_offset`` and limits; ``error``, ``integral``, ``output``, ``saturated`` its state; of steppers
     ``slewed``, ``anchor``, ``start_velocity``, ``last_velocity``; ``direction``, ``most``, ``asked``, ``presses`` of
-    force_end.py; ``limp`` axes are let go.
+    force_end.py; ``limp`` axes are let go; of ``tuned`` axes a command has set the gains, or the greatest force.
 
     Watch: see host_watch.py; ``derived`` where the axes are made of others, which are watched themselves.
 
@@ -140,6 +140,7 @@ class Loop(Record):
     asked: Floats
     presses: Flags
     limp: Flags
+    tuned: Flags
     desired: Floats
     desired_velocity: Floats
     following: Floats

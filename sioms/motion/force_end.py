@@ -6,7 +6,11 @@ press on it with all it has, although a few newtons were asked for. So the actua
 all its force, but in the direction of the motion, or of the force when the axis stood, at most with the force that was
 asked for, beside the offset. Where that is not enough to follow the set-point, the set-point yields: the axis holds
 where it is. An axis that is thrown back is braked with a tenth of its force if that is more. At rest the bound is
-lifted; what is held then is held against what pushes from outside.
+lifted; what is held then is held against what pushes from outside. A load that the bound does not carry must not sink
+or fall: it is lifted after a second, too, and from an axis that has gone back for as long as no bounce needs to come
+free.
+
+The same bound holds for an axis that is stopped while a command allows it less force than is configured.
 
 Pure; concurrency: that of its bank.
 """
@@ -20,6 +24,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .axis_step import REST, REST_NS
+
+LONGEST_NS, BACK_NS = 1_000_000_000, 100_000_000
+"""So long an axis is bounded at most, and while it goes back [ns]."""
 
 
 class ForceEnds:
@@ -40,6 +47,9 @@ class ForceEnds:
         self._most = np.zeros(n)
         self._presses = np.zeros(n, dtype=bool)
         self._moved_ns = np.zeros(n, dtype=np.int64)
+        self._forced = np.zeros(n, dtype=bool)
+        self._since_ns = np.zeros(n, dtype=np.int64)
+        self._ahead_ns = np.zeros(n, dtype=np.int64)
 
     def begin(self, axis: int, velocity: float, limit: float, offset: float) -> None:
         """Bound the output of an axis that leaves force mode.
@@ -54,10 +64,14 @@ class ForceEnds:
         if math.isnan(asked):  # it was over before any tick put it out
             return
         direction = math.copysign(1.0, velocity if abs(velocity) > REST * limit else asked)
-        self._direction[axis] = direction
-        self._most[axis] = max(0.0, asked * direction) + offset * direction
-        self._moved_ns[axis] = 0
-        self.asked[axis] = math.nan
+        self.hold_back(axis, direction, max(0.0, asked * direction) + offset * direction)
+        self._forced[axis] = True
+
+    def hold_back(self, axis: int, direction: float, most: float) -> None:
+        """Bound the output of an axis in a direction (its sign) until it has come to rest."""
+        self._direction[axis] = math.copysign(1.0, direction)
+        self._most[axis], self._moved_ns[axis], self._since_ns[axis] = most, 0, 0
+        self.asked[axis], self._forced[axis] = math.nan, False
         self.any = True
 
     def end(self, axes: NDArray[np.int64]) -> None:
@@ -69,6 +83,10 @@ class ForceEnds:
         """Tell which axes are bounded: they have not come to rest yet."""
         bound: NDArray[np.bool_] = self._direction[axes] != 0.0
         return bound
+
+    def has_left(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which axes are bounded because they have left force mode."""
+        return self.is_bound(axes) & self._forced[axes]
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what the law bounds outputs by, by the names of its fields."""
@@ -83,9 +101,13 @@ class ForceEnds:
             now_ns: instant of the tick.
         """
         bounded = self._direction != 0.0
+        self._since_ns[bounded & (self._since_ns == 0)] = now_ns
+        self._ahead_ns[~bounded | (velocity * self._direction > -REST * limit)] = now_ns
         moves = bounded & ((np.abs(velocity) > REST * limit) | (self._moved_ns == 0))
         self._moved_ns[moves] = now_ns
-        rested = np.flatnonzero(bounded & (now_ns - self._moved_ns > REST_NS))
+        over = bounded & ((now_ns - self._since_ns > LONGEST_NS) | (now_ns - self._ahead_ns > BACK_NS))
+        yields = np.flatnonzero(self._presses & bounded | over)
+        rested = np.flatnonzero(over | bounded & (now_ns - self._moved_ns > REST_NS))
         if rested.size:
             self.end(rested)
-        return np.flatnonzero(self._presses)
+        return yields

@@ -61,10 +61,10 @@ class LimitGuard:
         sequencer.outcome[axes[hit & force]] |= int(AxisStatus.FORCE_ENDED)
         self._queue.emit(EventKind.DROPPED, axes[hit], now_ns, errno.ERANGE, TEXT)
         sequencer.drop(axes[hit])
-        free = axes[hit & force]
-        if free.size:
-            sequencer.brake(free, sequencer.state(free, now_ns), now_ns)
-        for axis in axes[hit & ~force].tolist():
+        free = force | sequencer.is_tuned(axes)  # not where their set-points are
+        if (hit & free).any():
+            sequencer.stop(axes[hit & free], now_ns, now_ns)
+        for axis in axes[hit & ~free].tolist():
             self._brake_in_time(np.array([axis]), last_ns, now_ns)
         sequencer.advance(now_ns)
         return True
@@ -87,4 +87,4 @@ class LimitGuard:
                 late = middle
             else:
                 early = middle
-        self._sequencer.brake(axis, store.state(axis, early), early)
+        self._sequencer.brake(axis, store.state(axis, early), early, self._limits.acceleration[axis])

@@ -173,8 +173,8 @@ class AxisBank(Bank):
     def _halt(self, axes: Axes, now_ns: int, *, fastest: bool) -> None:
         """Brake; in force mode the controlled stop holds, the fastest one lets go until reset(), when it has braked."""
         brakes, self._braked_ns = self._braked_ns > 0, 0
-        bound = self._law.force_ends.is_bound(axes)  # also one that brakes since it has left force mode
-        in_force = axes[(self._sequencer.kind[axes] == FORCE) | bound] if fastest else axes[:0]
+        left = self._law.force_ends.has_left(axes)  # also one that brakes since it has left force mode
+        in_force = axes[(self._sequencer.kind[axes] == FORCE) | left] if fastest else axes[:0]
         self._homing.cancel(axes)
         self._sequencer.halt(axes, now_ns, brakes=brakes)
         if in_force.size:
@@ -206,7 +206,8 @@ class AxisBank(Bank):
             rests, moving = limp[~moves], limp[moves]
             self._sequencer.hold(rests, self._position[rests], self._last_ns)
             if moving.size:
-                self._sequencer.brake(moving, np.stack(self._law.actual(moving), axis=1), self._last_ns)
+                state = np.stack(self._law.actual(moving), axis=1)
+                self._sequencer.brake(moving, state, self._last_ns, self._sequencer.hardest(moving))
 
     def _is_too_late(self, start_ns: int, now_ns: int) -> bool:
         return now_ns - start_ns > self._tick_s * 1e9
@@ -221,7 +222,7 @@ class AxisBank(Bank):
         held = self._queue.limits
         self._law.velocity_limit[axes] = held.velocity[axes]
         self._law.acceleration_limit[axes] = held.acceleration[axes]
-        self._law.limit_force(axes, held.force[axes])
+        self._law.configure_force(axes, held.force[axes])
 
     def _home(self, axes: Axes, now_ns: int) -> None:
         self._homing.begin(axes, now_ns)

@@ -16,12 +16,17 @@ from .settings import AxisKind, AxisSettings
 from .store import NEVER_NS
 
 Vector = NDArray[np.float64]
+FORCE_ROW = 4
+"""Of what commands may set: the gains k, kz, kp, kb, and the greatest force."""
 FOLLOWS_S = 0.5
 """What its velocity limit covers in this time, an axis may be behind that has no following_error_max of its own [s]."""
 
 
 class ControlLaw:
     """State and gains of the laws of n axes. Gains and limits are arrays (n,), free to change between ticks.
+
+    Commands may set gains and the greatest force. They hold for what commands do; whatever stops or holds an axis
+    otherwise does so with what is configured (``brace``), which is in force until a command begins (``recall``).
 
     Args:
         settings: one per axis.
@@ -37,6 +42,7 @@ class ControlLaw:
         kind, guard, begun, event_status: the sequencer's.
         limp: axes that are let go.
         speed_most: speed at which a force command ends.
+        tuned: gains or greatest force in force are not the configured ones.
         actuator: what the actuators shall do.
     """
 
@@ -97,7 +103,12 @@ class ControlLaw:
         self._error_max: Vector = arrays["error_max"]
         self._error: Vector = arrays["error"]
         self._integral: Vector = arrays["integral"]
-        self.limit_force(np.arange(n), self.force_limit)
+        self.tuned: NDArray[np.bool_] = arrays["tuned"]
+        self._in_force = (self.k, self.kz, self.kp, self.kb, self.force_limit)
+        self._configured = np.array(self._in_force)
+        self._commanded = self._configured.copy()
+        self._braced = np.zeros(n, dtype=bool)
+        self._limit_force(np.arange(n))
 
     def anchor_at(self, axis: int, position: float) -> None:
         """Call the place at which a stepper stands ``position``; the raw output does not change."""
@@ -109,12 +120,78 @@ class ControlLaw:
         self.slewed[axis] += by
         self.anchor[axis] += by
 
-    def limit_force(self, axes: NDArray[np.int64], most: Vector | float) -> None:
-        """Put limits of the force in force [N or N*m].
+    def configure_force(self, axes: NDArray[np.int64], most: Vector) -> None:
+        """Set the greatest force of axes anew, for commands and stops [N or N*m]."""
+        self._configured[FORCE_ROW, axes] = most
+        self._command(axes, FORCE_ROW, most)
+
+    def command_force(self, axis: int, most: float) -> None:
+        """Put the greatest force of a command in force [N or N*m]."""
+        self._command(np.array([axis]), FORCE_ROW, most)
+
+    def command_gains(self, axis: int, gains: tuple[float, float, float, float]) -> None:
+        """Put the gains k, kz, kp, kb of a command in force."""
+        self._command(np.array([axis]), slice(FORCE_ROW), np.array(gains)[:, None])
+
+    def commanded_force(self, axis: int) -> float:
+        """Return the greatest force of commands that do not say another."""
+        return float(self._commanded[FORCE_ROW, axis])
+
+    def _command(self, axes: NDArray[np.int64], rows: int | slice, values: Vector | float) -> None:
+        self._commanded[rows, axes] = values
+        self._put(axes, self._commanded[:, axes])
+
+    def _put(self, axes: NDArray[np.int64], values: Vector) -> None:
+        for array, row in zip(self._in_force, values, strict=True):
+            array[axes] = row
+        self.tuned[axes] = (values != self._configured[:, axes]).any(axis=0)
+        self._braced[axes] = False
+        self._limit_force(axes)
+
+    def recall(self, axes: NDArray[np.int64]) -> None:
+        """Put in force again what commands have set: one begins."""
+        braced = axes[self._braced[axes]]
+        if braced.size:
+            self._put(braced, self._commanded[:, braced])
+
+    def brace(self, axes: NDArray[np.int64]) -> Vector:
+        """Put what is configured in force, until a command begins; return where the axes are to be held or braked from.
+
+        That is where a servo is, and as far beside it as has the law go on with the force that it has put out; but for
+        force that drives an axis on. In the direction of its motion, or of the force when it stands, it presses no
+        harder than it was allowed before, until it has come to rest.
+        """
+        position, velocity = self.actual(axes)
+        tuned = self.tuned[axes]
+        if not tuned.any():
+            return position
+        chosen, velocity = axes[tuned], velocity[tuned]
+        moves, allowed = self.moves(chosen), self.force_limit[chosen].copy()
+        self._put(chosen, self._configured[:, chosen])
+        in_force = self.kind[chosen] == FORCE  # which is bounded by what was asked, when it ends
+        toward = np.where(moves, velocity, self.output[chosen])
+        held_back = (allowed < self.force_limit[chosen]) & (toward != 0.0) & ~in_force
+        for i in np.flatnonzero(held_back).tolist():
+            self.force_ends.hold_back(int(chosen[i]), float(toward[i]), float(allowed[i]))
+        self._braced[chosen] = True
+        self.give_way(chosen)
+        servo = ~self.stepper[chosen] & ~in_force
+        chosen, velocity, moves = chosen[servo], velocity[servo], moves[servo]
+        output, offset = self.output[chosen], self.offset[chosen]
+        limit = self.force_limit[chosen]
+        output = np.where(moves & ((output - offset) * velocity > 0.0), offset, np.clip(output, -limit, limit))
+        gain = self.k[chosen] * (1.0 + self.kz[chosen])
+        wish = output * (1.0 + self.kp[chosen]) - offset - self.kb[chosen] * velocity
+        lead = np.divide(wish, gain, out=np.zeros(len(chosen)), where=gain > 0.0)
+        self._error[chosen] = lead
+        position[np.flatnonzero(tuned)[servo]] += lead
+        return position
+
+    def _limit_force(self, axes: NDArray[np.int64]) -> None:
+        """Judge how far axes may be behind.
 
         A servo that may use all its force has to follow; one that is held back on purpose may meet something.
         """
-        self.force_limit[axes] = most
         follows = ~self.stepper[axes] & (self.force_limit[axes] >= self._force_max[axes])
         usual = np.where(follows, self._usual_error[axes], np.inf)
         told = self._told_error[axes]

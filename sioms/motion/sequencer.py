@@ -113,6 +113,7 @@ class Sequencer:
         self.arrivals = arrivals
         self._approaches = [Approach.of(s) for s in settings]
         self._start_velocity = [s.start_velocity for s in settings]
+        self._hardest = np.array([s.acceleration_max for s in settings])
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
         self._ended_ns, self._idle_ns = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
@@ -261,34 +262,54 @@ class Sequencer:
         """
         waited = axes[(self.kind[axes] == HOLD) & self._queue.has_head[axes]]
         self.drop(axes)
-        moves = (self.kind[axes] != HOLD) & (self.kind[axes] != STOP)
-        moving = axes[moves if brakes else moves | self._law.is_behind(axes)]
+        tuned = self._law.tuned[axes]
+        moves = (self.kind[axes] != HOLD) & (self.kind[axes] != STOP) | tuned & self._law.moves(axes)
+        if not brakes:
+            moves |= self._law.is_behind(axes)
+        moving, resting = axes[moves], axes[tuned & ~moves]
         if moving.size:
             self.stop(moving, now_ns, now_ns)
             self.advance(now_ns)
+        if resting.size:
+            self.hold(resting, self._law.brace(resting), now_ns)
         if waited.size:
             self._queue.emit(EventKind.IDLE, waited[self.is_idle(waited)], now_ns)
         self.refresh(axes)
 
     def stop(self, axes: Axes, seen_ns: int, start_ns: int) -> None:
         """Stop at maximum deceleration, beginning at start_ns, from the state of seen_ns: that of the set-points, or
-        the actual one of axes that cannot follow them.
+        the actual one of axes that cannot follow them, or do so by gains or with a force that a command has set.
         """
-        state, behind = self.state(axes, seen_ns), self._law.is_behind(axes)
+        law = self._law
+        state, behind, pressing = self.state(axes, seen_ns), law.is_behind(axes), self.kind[axes] == FORCE
+        most, tuned = self._limits.acceleration[axes], law.tuned[axes]
+        measured = tuned | pressing  # no profile has made their velocities
+        if measured.any():
+            most[measured] = self._hardest[axes[measured]]
+            state[tuned, 1] = law.actual(axes[tuned])[1]
+            state[tuned, 0] = law.brace(axes)[tuned]
         if behind.any():
             late = axes[behind]
-            state[behind, 0], state[behind, 1] = self._law.actual(late)
-            self._law.give_way(late)
-        self.brake(axes, state, start_ns)
+            state[behind, 0], state[behind, 1] = law.actual(late)
+            law.give_way(late)
+        self.brake(axes, state, start_ns, most)
 
-    def brake(self, axes: Axes, state: Floats, start_ns: int) -> None:
-        """Stop from state (m, 2 or 3) at maximum deceleration, beginning at start_ns."""
+    def is_tuned(self, axes: Axes) -> NDArray[np.bool_]:
+        """Tell on which axes gains or the greatest force of a command are in force (m,)."""
+        return self._law.tuned[axes]
+
+    def hardest(self, axes: Axes) -> Floats:
+        """Return the configured deceleration of axes, whose velocities no profile has made (m,)."""
+        return self._hardest[axes]
+
+    def brake(self, axes: Axes, state: Floats, start_ns: int, most: Floats) -> None:
+        """Stop from state (m, 2 or 3) at a deceleration of most (m,), beginning at start_ns."""
         store = self.store
-        store.put_brake(store.row[axes], state[:, 0], state[:, 1], self._limits.acceleration[axes])
+        store.put_brake(store.row[axes], state[:, 0], state[:, 1], most)
         self._run_now(axes, STOP, start_ns)
 
     def hold(self, axes: Axes, position: Floats, start_ns: int) -> None:
-        """Rest at position."""
+        """Rest at position, which is where they are."""
         self.store.put_hold(self.store.row[axes], position)
         self._run_now(axes, HOLD, start_ns)
 
@@ -304,12 +325,15 @@ class Sequencer:
         command = Command._make([0.0] * len(Command._fields))
         command = command._replace(control_mode=modes.VELOCITY, velocity=velocity)
         p, v, a = self.state(one, now_ns)[0].tolist()
+        if self._law.tuned[axis]:
+            p, v, a = float(self._law.brace(one)[0]), 0.0, 0.0
         bounds = self._bounds(axis, command)._replace(minimum=-math.inf, maximum=math.inf)
         self.store.put(int(self.store.row[axis]), self._planner.plan(command, (p, v, a), bounds))
         self._law.force_ends.end(one)
         self._run_now(one, RATE, now_ns)
 
     def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
+        self._law.brace(axes)  # what no command has asked for is done by the gains that are configured
         self._set_kind(axes, kind)
         self.stopped[axes] = kind == STOP
         self._row_taken[self.store.row[axes]] = False
@@ -458,6 +482,7 @@ class Sequencer:
                 self._held.pop(axis, None)
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
+        self._law.recall(axes)
         self.kind[axes] = self._row_kind[rows]
         pressing = axes[self.kind[axes] == FORCE]
         if pressing.size:
@@ -480,11 +505,11 @@ class Sequencer:
             return
         law, mode = self._law, command.control_mode
         if mode & modes.GAINS:
-            law.k[axis], law.kz[axis], law.kp[axis], law.kb[axis] = command.k, command.kz, command.kp, command.kb
+            law.command_gains(axis, (command.k, command.kz, command.kp, command.kb))
         if mode & modes.FORCE_OFFSET:
             law.offset[axis] = command.force_offset
         if mode & modes.MAX_FORCE:
-            law.limit_force(np.array([axis]), command.max_force)
+            law.command_force(axis, command.max_force)
         if mode & modes.MAX_VEL_ACC:
             self._velocity_limit[axis] = command.max_velocity
             self._acceleration_limit[axis] = command.max_acceleration
@@ -636,7 +661,7 @@ class Sequencer:
         return Bounds(velocity, acceleration, jerk, low, high, self._start_velocity[axis])
 
     def _plan_force(self, axis: int, command: Command) -> Plan:
-        limit = command.max_force if command.control_mode & modes.MAX_FORCE else float(self._law.force_limit[axis])
+        limit = command.max_force if command.control_mode & modes.MAX_FORCE else self._law.commanded_force(axis)
         present = self.store.final[self.store.row[axis], 0] if self.kind[axis] == FORCE else self._law.output[axis]
         return plan_force(command, float(present), limit)
 

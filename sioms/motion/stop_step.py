@@ -48,7 +48,7 @@ def stop_axes(s: Plans, now_ns: int, latches: int) -> int:
     if now_ns >= a.next_ns:
         return 1
     for i in range(a.n):
-        if a.kind[i] == FORCE or s.cut_ns[i] != UNCUT_NS or is_behind(a, i):
+        if a.kind[i] == FORCE or a.tuned[i] or s.cut_ns[i] != UNCUT_NS or is_behind(a, i):
             return 1
     for i in range(a.n):
         s.fresh[i] = not a.latched[i] & AxisStatus.EMERGENCY_STOP

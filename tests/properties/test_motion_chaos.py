@@ -70,8 +70,7 @@ class Chaos(Rig):
         assert np.isfinite(output).all()
         assert np.abs(output[:2]).max() <= 10.0
         raw = self.raw.copy()
-        # Gains of a command may be 0: then the plant alone brakes, within the ticks that a stop is given below.
-        self.speed[:2] += (output[:2] - 8.0 * self.speed[:2]) / 1.0 * dt
+        self.speed[:2] += (output[:2] - 2.0 * self.speed[:2]) / 1.0 * dt
         raw[:2] += self.speed[:2] * dt
         raw[2] = output[2]
         return raw

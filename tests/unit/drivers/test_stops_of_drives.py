@@ -133,6 +133,38 @@ def test_a_motor_that_does_not_obey_keeps_no_other_from_being_stopped() -> None:
     assert rig.device.motors[0].mover.velocity == 0
 
 
+def running(kind: str) -> tuple[Joined, Any]:
+    """Return a drive of a kind that runs at a velocity, and what tells how fast it goes [its own unit/s]."""
+    x = {"name": "x", "travel_per_turn": 0.01, **LIMITS}
+    rig: Joined
+    if kind == "tmcl":
+        rig = Joined(Tmcl, {"axis": [{**x, "motor": 0}]}, lambda clock: tmcl.Module(clock=clock))
+        speed = lambda: rig.device.motors[0].mover.velocity  # noqa: E731
+    elif kind == "odrive":
+        table = {"axis": [{**x, "number": 0}], "watchdog_s": 0.0, "quick_stop": "hold"}
+        rig = Joined(Odrive, table, lambda clock: odrive.Board(clock=clock))
+        speed = lambda: rig.device.axes[0].velocity  # noqa: E731
+    else:
+        rig = servo("velocity", quick_stop="hold")
+        speed = lambda: rig.device.servos[1].mover.velocity  # noqa: E731
+    rig.do(rig.unit.open())
+    rig.do(rig.unit.start_velocity(0, 0.06, DriveAction(ActionKind.START, 0, None, 0.1, 1.0)))
+    rig.wait(0.3)
+    return rig, speed
+
+
+@pytest.mark.parametrize("fastest", [False, True])
+@pytest.mark.parametrize("kind", ["tmcl", "odrive", "dynamixel"])
+def test_a_slow_ramp_of_a_command_does_not_prolong_a_stop(kind: str, fastest: bool) -> None:
+    rig, speed = running(kind)
+    before = abs(speed())
+    rig.do(rig.unit.start_velocity(0, 0.05, DriveAction(ActionKind.START, 0, None, 0.1, 0.02)))
+    assert abs(speed()) > 0.9 * before
+    rig.do(rig.unit.halt(0, fastest=fastest))
+    rig.wait(0.06 + 0.06)  # 0.06 m/s at 1 m/s^2; with that of the command it would take 3 s
+    assert abs(speed()) < 0.02 * before
+
+
 # --- ODrive ---------------------------------------------------------------------------------------
 
 

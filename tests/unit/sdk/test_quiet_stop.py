@@ -220,3 +220,26 @@ def test_who_is_behind_by_the_step_is_so_by_the_law():
         assert found == law.is_behind(np.array(AXES)).tolist()
         seen.update(found)
     assert seen == {True, False}
+
+
+def test_steps_leave_axes_that_run_with_gains_of_a_command_to_the_bank():
+    cell = Cell(True)
+    bank, records = cell.driver.bank, np.zeros(1, numpy_dtype(NodeClass.AXIS))
+    records["control_mode"], records["velocity"] = int(ControlMode.VELOCITY), 0.1
+    now_ns = go_on(cell, 1_000_000_000, 20)
+    bank.append(records, AXES, now_ns)
+    now_ns = go_on(cell, now_ns, 100)
+    configured = bank.rows["k"][0]
+    records["control_mode"] |= int(ControlMode.SPECIFIED_GAINS)  # all of 0
+    bank.append(records, AXES, now_ns, replace=True)
+    now_ns = go_on(cell, now_ns, 5)
+    assert bank.rows["k"][0] == 0.0
+    assert not stop_by_steps(cell, now_ns)
+    bank.emergency_stop(AXES, now_ns)
+    assert bank.rows["k"][0] == configured
+    now_ns = go_on(cell, now_ns, 500)
+    assert abs(bank.rows["velocity"][0]) < 1e-3
+    bank.reset(AXES)
+    now_ns = go_on(cell, now_ns, 20)
+    assert stop_by_steps(cell, now_ns)
+    take_back(cell)

@@ -1,0 +1,233 @@
+"""Stops of axes whose gains, or greatest force, a command has set: they brake and hold with what is configured.
+
+The plants are Newton's law and nothing else; what the tests ask for follows from it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import Phase, given, settings
+from hypothesis import strategies as st
+
+from sioms.motion import AxisKind, Homing
+from sioms.motion.settings import SWITCH_HOME, Watch
+from sioms.protocol.flags import AxisStatus, ControlMode
+
+from ...motion_rig import Rig, axis
+from .test_behind import Mass
+
+POSITION, VELOCITY, FORCE = ControlMode.POSITION, ControlMode.VELOCITY, ControlMode.FORCE
+GAINS, MAX_FORCE = ControlMode.SPECIFIED_GAINS, ControlMode.SPECIFIED_MAX_FORCE
+CONFIGURED = {"k": 400.0, "kb": -40.0, "following_error_max": np.inf, "acceleration_max": 5.0, "jerk_max": None,
+              "watch": Watch(uncommanded=False)}  # fmt: skip
+HARMFUL = [
+    {"k": 0.0},
+    {"k": 1e-6},
+    {"k": -100.0},
+    {"kb": 30.0},
+    {"k": 1.0, "kz": -1.0},
+    {"k": 0.0, "kp": 0.99},
+]
+STOPS = ("stop", "emergency_stop", "late", "abandon")
+
+
+def rig_of(plant: Mass, **changes: float) -> Rig:
+    return Rig([axis(**{**CONFIGURED, **changes})], plant=plant)
+
+
+def end_by(rig: Rig, how: str) -> None:
+    if how == "late":
+        rig.now_ns += 60_000_000
+    elif how == "abandon":
+        rig.bank.abandon(rig.axes, rig.now_ns, 32, "its client has died")
+    else:
+        getattr(rig.bank, how)(rig.axes, rig.now_ns)
+
+
+@pytest.mark.parametrize("stop", STOPS)
+@pytest.mark.parametrize("gains", HARMFUL, ids=str)
+def test_an_axis_that_its_own_gains_do_not_brake_is_braked(gains: dict[str, float], stop: str) -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant)
+    rig.write(mode=VELOCITY, velocity=0.3)
+    rig.tick(500)
+    rig.write(mode=VELOCITY | GAINS, velocity=0.3, replace=True, **gains)
+    rig.tick(20)
+    place, speed = plant.position, plant.velocity
+    end_by(rig, stop)
+    coasts = speed * 0.061 if stop == "late" else 0.0
+    rig.tick(1)
+    fastest, farthest = 0.0, 0.0
+    for _ in range(2000):
+        rig.tick()
+        fastest, farthest = max(fastest, abs(plant.velocity)), max(farthest, plant.position)
+    assert fastest <= abs(speed) + 0.01
+    assert farthest - place <= speed**2 / (2 * 5.0) + 40.0 / 400.0 * abs(speed) + coasts + 0.01
+    assert abs(plant.velocity) < 1e-3
+    assert rig.bank.is_idle(rig.axes)
+    assert rig.field("k") == 400.0 and rig.field("kb") == -40.0
+
+
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop"))
+def test_an_axis_at_rest_that_nothing_holds_is_held(stop: str) -> None:
+    plant = Mass(viscous=0.0, pull=-2.0)  # a weight
+    rig = rig_of(plant)
+    rig.write(mode=POSITION, position=0.5)
+    rig.run()
+    rig.tick(500)
+    rig.write(mode=POSITION | GAINS, position=0.5, k=0.0)
+    rig.tick(100)
+    assert rig.bank.is_idle(rig.axes) and plant.velocity < -0.1  # it falls
+    place = plant.position
+    getattr(rig.bank, stop)(rig.axes, rig.now_ns)
+    rig.tick(1500)
+    assert abs(plant.velocity) < 1e-3
+    assert place - plant.position < 0.05
+
+
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop"))
+@pytest.mark.parametrize("pull", (-3.0, 3.0))
+def test_a_soft_axis_that_is_pressed_away_does_not_leap(pull: float, stop: str) -> None:
+    plant = Mass(viscous=5.0)
+    rig = rig_of(plant)
+    rig.write(mode=POSITION | GAINS, position=0.5, k=10.0, kb=-6.0)
+    rig.run()
+    plant.pull = pull
+    rig.tick(5000)
+    assert abs(plant.position - 0.5 - pull / 10.0) < 0.01  # so far it has yielded
+    place = plant.position
+    getattr(rig.bank, stop)(rig.axes, rig.now_ns)
+    places = []
+    for _ in range(1000):
+        rig.tick()
+        places.append(plant.position)
+        assert abs(rig.field("force") + pull) < 0.5  # it goes on holding against what presses
+    assert np.abs(np.array(places) - place).max() < 1e-3
+
+
+def test_homing_does_not_leap_either() -> None:
+    plant = Mass(viscous=5.0)
+    homing = Homing(velocity=0.1, slow_velocity=0.02, offset=0.0, travel=2.0)
+    rig = rig_of(plant, homing=homing)
+    rig.switches = lambda raw: (raw < -0.2) * SWITCH_HOME
+    rig.write(mode=POSITION | GAINS, position=0.5, k=10.0, kb=-6.0)
+    rig.run()
+    plant.pull = 3.0
+    rig.tick(5000)
+    before = plant.position
+    rig.bank.home(rig.axes, rig.now_ns)
+    rig.tick(100)
+    assert abs(plant.position - before) < 0.1 * 0.1 + 0.005
+    assert rig.trace("velocity")[-100:].min() > -0.15
+
+
+@pytest.mark.parametrize("stop", STOPS)
+def test_a_small_force_of_a_command_does_not_bound_the_brakes(stop: str) -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant)
+    rig.write(mode=VELOCITY, velocity=0.5)
+    rig.tick(500)
+    rig.write(mode=VELOCITY | MAX_FORCE, velocity=0.5, max_force=0.01, replace=True)
+    rig.tick(20)
+    place = plant.position
+    end_by(rig, stop)
+    rig.tick(2000)
+    assert abs(plant.velocity) < 1e-3
+    assert plant.position - place < 0.5**2 / 10 + 0.1 * 0.5 + (0.031 if stop == "late" else 0.0) + 0.01
+
+
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop"))
+@pytest.mark.parametrize("way", (0.0, 0.002, 0.02))
+def test_what_was_to_press_gently_does_not_press_harder_for_a_stop(way: float, stop: str) -> None:
+    plant = Mass(viscous=0.0, wall=0.3)
+    rig = rig_of(plant)
+    rig.write(mode=POSITION | MAX_FORCE, position=1.0, max_force=2.0, max_velocity=0.2)
+    for _ in range(5000):
+        if plant.position >= 0.3 - way:
+            break
+        rig.tick()
+    getattr(rig.bank, stop)(rig.axes, rig.now_ns)
+    rig.tick(2000)
+    assert rig.trace("force")[-2000:].max() <= 2.0 + 1e-9
+    assert rig.bank.is_idle(rig.axes) and plant.velocity == pytest.approx(0.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    "gains", ({"k": 0.0}, {"k": -500.0}, {"k": 1000.0, "kb": 3.0}, {"k": 900.0, "kp": -0.99}), ids=str
+)
+def test_a_stepper_stops_whatever_its_gains(gains: dict[str, float]) -> None:
+    rig = Rig([axis(kind=AxisKind.STEPPER, k=None)], plant=lambda output, dt: output.copy())
+    rig.write(mode=VELOCITY, velocity=0.5)
+    rig.tick(300)
+    rig.write(mode=VELOCITY | GAINS, velocity=0.5, replace=True, **gains)
+    rig.tick(5)
+    place, speed = rig.field("position"), abs(rig.field("velocity"))
+    rig.bank.emergency_stop(rig.axes, rig.now_ns)
+    rig.tick(1000)
+    assert abs(rig.field("position") - place) <= speed**2 / 10 + 0.01
+    assert rig.field("position") == rig.trace("position")[-10]
+    assert rig.bank.is_idle(rig.axes)
+
+
+def test_the_next_command_has_its_gains_again() -> None:
+    plant = Mass()
+    rig = rig_of(plant)
+    rig.write(mode=POSITION | GAINS | MAX_FORCE, position=0.5, k=50.0, kb=-15.0, max_force=3.0)
+    rig.tick(200)
+    assert rig.field("k") == 50.0
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(1500)
+    assert rig.field("k") == 400.0
+    rig.write(mode=POSITION, position=0.0)
+    rig.tick(1)
+    assert (rig.field("k"), rig.field("kb")) == (50.0, -15.0)
+    rig.tick(200)
+    assert rig.trace("force").max() <= 3.0
+    rig.write(mode=FORCE, force=9.0, replace=True)  # what a command has allowed bounds the next ones
+    rig.tick(300)
+    assert rig.trace("force").max() <= 3.0
+
+
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop"))
+def test_a_narrowed_acceleration_does_not_lengthen_the_end_of_a_force(stop: str) -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant, position_min=None, position_max=None)
+    rig.bank.set_limits(rig.axes, acceleration_max=1e-3)
+    rig.write(mode=FORCE, force=9.0)
+    while plant.velocity < 0.2:
+        rig.tick()
+    place, speed = plant.position, plant.velocity
+    getattr(rig.bank, stop)(rig.axes, rig.now_ns)
+    rig.tick(2000)
+    assert abs(plant.velocity) < 0.01 * 2.0  # an emergency stop lets go at this speed
+    assert plant.position - place < speed**2 / 10 + 0.1 * speed + 0.01
+
+
+@settings(max_examples=25, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
+@given(
+    k=st.floats(-500, 5000), kb=st.floats(-100, 50), kz=st.floats(-2, 1), kp=st.floats(-0.99, 0.99),
+    most=st.floats(0.05, 10.0), mass=st.floats(0.5, 3.0), viscous=st.floats(0, 8), pull=st.floats(-2, 2),
+    before=st.integers(1, 250), also_force=st.booleans(), emergency=st.booleans(),
+)  # fmt: skip
+def test_an_axis_stands_soon_whatever_a_command_has_set(
+    k: float, kb: float, kz: float, kp: float, most: float, mass: float, viscous: float, pull: float,
+    before: int, also_force: bool, emergency: bool,
+) -> None:  # fmt: skip
+    plant = Mass(mass=mass, viscous=viscous)
+    rig = rig_of(plant, position_min=None, position_max=None, acceleration_max=2.0)
+    plant.pull = pull
+    rig.write(mode=VELOCITY, velocity=0.3)
+    rig.tick(300)
+    mode = VELOCITY | GAINS | (MAX_FORCE if also_force else 0)
+    rig.write(mode=mode, velocity=0.3, k=k, kb=kb, kz=kz, kp=kp, max_force=most, replace=True)
+    rig.tick(before)
+    place, speed = plant.position, abs(plant.velocity)
+    (rig.bank.emergency_stop if emergency else rig.bank.stop)(rig.axes, rig.now_ns)
+    rig.tick(3000)
+    assert abs(plant.velocity) < 2e-3
+    weakest = (10.0 - abs(pull)) / mass  # the motor's deceleration against what pulls
+    carried = 10.0 / 400  # what keeps the output as it was, which need not be a load
+    way = speed**2 / (2 * min(2.0, weakest)) + 0.1 * speed + carried + 0.01
+    assert abs(plant.position - place) <= 2 * way
+    assert bool(int(rig.field("status")) & AxisStatus.EMERGENCY_STOP) == emergency
