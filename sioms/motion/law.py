@@ -43,6 +43,7 @@ class ControlLaw:
         limp: axes that are let go.
         speed_most: speed at which a force command ends.
         tuned: gains or greatest force in force are not the configured ones.
+        any_braced: there are axes on which commands have set others than are in force.
         actuator: what the actuators shall do.
     """
 
@@ -108,6 +109,7 @@ class ControlLaw:
         self._configured = np.array(self._in_force)
         self._commanded = self._configured.copy()
         self._braced = np.zeros(n, dtype=bool)
+        self.any_braced = False
         self._limit_force(np.arange(n))
 
     def anchor_at(self, axis: int, position: float) -> None:
@@ -146,6 +148,7 @@ class ControlLaw:
             array[axes] = row
         self.tuned[axes] = (values != self._configured[:, axes]).any(axis=0)
         self._braced[axes] = False
+        self.any_braced = bool(self._braced.any())
         self._limit_force(axes)
 
     def recall(self, axes: NDArray[np.int64]) -> None:
@@ -173,7 +176,7 @@ class ControlLaw:
         held_back = (allowed < self.force_limit[chosen]) & (toward != 0.0) & ~in_force
         for i in np.flatnonzero(held_back).tolist():
             self.force_ends.hold_back(int(chosen[i]), float(toward[i]), float(allowed[i]))
-        self._braced[chosen] = True
+        self._braced[chosen] = self.any_braced = True
         self.give_way(chosen)
         servo = ~self.stepper[chosen] & ~in_force
         chosen, velocity, moves = chosen[servo], velocity[servo], moves[servo]
@@ -230,7 +233,8 @@ class ControlLaw:
         gain = self.k[axes] * (1.0 + self.kz[axes])
         force = self.force_limit[axes] * (1.0 + np.abs(self.kp[axes])) + np.abs(self.kb[axes] * self._velocity[axes])
         error: Vector = np.full(len(axes), np.inf)
-        np.divide(force, gain, out=error, where=(gain > 0.0) & ~self.stepper[axes])
+        with np.errstate(over="ignore"):  # a gain of next to nothing asks for all the force nowhere
+            np.divide(force, gain, out=error, where=(gain > 0.0) & ~self.stepper[axes])
         return error
 
     def give_way(self, axes: NDArray[np.int64]) -> None:

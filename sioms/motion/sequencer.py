@@ -482,7 +482,8 @@ class Sequencer:
                 self._held.pop(axis, None)
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
-        self._law.recall(axes)
+        if self._law.any_braced:
+            self._law.recall(axes)
         self.kind[axes] = self._row_kind[rows]
         pressing = axes[self.kind[axes] == FORCE]
         if pressing.size:

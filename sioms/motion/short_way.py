@@ -67,6 +67,8 @@ class ShortWay:
         except InfeasibleError:
             return False
         ended = []
+        if self._law.any_braced:
+            self._law.recall(np.array(axes))
         for command, each in zip(commands, planned, strict=True):
             axis = command.axis
             queue.end_with(command)

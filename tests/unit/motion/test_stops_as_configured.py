@@ -170,16 +170,19 @@ def test_a_stepper_stops_whatever_its_gains(gains: dict[str, float]) -> None:
     assert rig.bank.is_idle(rig.axes)
 
 
-def test_the_next_command_has_its_gains_again() -> None:
+@pytest.mark.parametrize("others", (0, 7))
+def test_the_next_command_has_its_gains_again(others: int) -> None:
+    """However many axes begin at once: a few go a way of their own."""
     plant = Mass()
-    rig = rig_of(plant)
+    idle = [axis(**CONFIGURED) for _ in range(others)]
+    rig = Rig([axis(**CONFIGURED), *idle], plant=lambda force, dt: np.append(plant(force, dt), np.zeros(others)))
     rig.write(mode=POSITION | GAINS | MAX_FORCE, position=0.5, k=50.0, kb=-15.0, max_force=3.0)
     rig.tick(200)
     assert rig.field("k") == 50.0
     rig.bank.stop(rig.axes, rig.now_ns)
     rig.tick(1500)
     assert rig.field("k") == 400.0
-    rig.write(mode=POSITION, position=0.0)
+    rig.write(mode=POSITION, position=np.zeros(others + 1), axis=np.arange(others + 1))
     rig.tick(1)
     assert (rig.field("k"), rig.field("kb")) == (50.0, -15.0)
     rig.tick(200)
