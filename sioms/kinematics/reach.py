@@ -10,6 +10,8 @@ from .transform import Transform
 
 _SLACK = 1e-7
 """What rounding may take a set-point beyond a limit [m or rad]."""
+_FAR = 16
+"""Doublings of a step within which coordinates that no joints have must come to some that joints have."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,7 +50,7 @@ class Reach:
     def check(self, wanted: Sequence[float], present: Sequence[float], measured: Sequence[float]) -> None:
         """Look whether joints can be where coordinates want them.
 
-        A joint that is beyond a limit already may come back.
+        A joint that is beyond a limit already may come back, and so may coordinates that no joints have.
 
         Args:
             wanted: coordinates.
@@ -58,7 +60,13 @@ class Reach:
         Raises:
             ValueError: no joints have these coordinates, or one would leave its limits, with a sentence.
         """
-        found, here = self.transform.inverse(wanted), self.transform.inverse(present)
+        try:
+            here = self.transform.inverse(present)
+        except ValueError:  # by as much as an encoder's step, or they were found so
+            if self._comes_back(wanted, present):
+                return
+            raise
+        found = self.transform.inverse(wanted)
         for joint, there, base, now in zip(self.joints, found, here, measured, strict=True):
             position = there - base + now
             if not joint.beyond(position) <= joint.beyond(now) + _SLACK:
@@ -66,6 +74,19 @@ class Reach:
                     f"axis {joint.name} would be at {position:.6g} {joint.unit}; want {joint.minimum:g} to "
                     f"{joint.maximum:g} {joint.unit}"
                 )
+
+    def _comes_back(self, wanted: Sequence[float], present: Sequence[float]) -> bool:
+        """Tell whether the way from coordinates that no joints have leads to some that joints have, and not away."""
+        way = [to - at for to, at in zip(wanted, present, strict=True)]
+        if not any(way):
+            return True
+        for step in (sign * 2.0**double for double in range(_FAR) for sign in (1.0, -1.0)):
+            try:
+                self.transform.inverse([at + step * by for at, by in zip(present, way, strict=True)])
+            except ValueError:
+                continue
+            return step > 0.0
+        return False
 
     def rates(self, coordinates: Sequence[float], wanted: Sequence[float]) -> tuple[list[float], float]:
         """Return the joints' velocities, and the part of the wanted rates that they are: 1 unless one is too fast."""

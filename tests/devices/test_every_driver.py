@@ -21,8 +21,9 @@ UNCHECKED = [rig for rig in RIGS if not rig.line and rig.driver != "iio"]
 every_unchecked_rig = pytest.mark.parametrize("rig", UNCHECKED, ids=lambda rig: rig.title)
 
 
-OVER_OTHERS = {"gantry", "hand", "slits"}
-"""Drivers whose axes are those of other devices: tests/process/test_compound.py, tests/unit/drivers/test_hand.py."""
+OVER_OTHERS = {"arm", "gantry", "hand", "mill", "slits"}
+"""Drivers whose axes are those of other devices: tests/process/test_compound.py, tests/unit/drivers/test_hand.py,
+tests/unit/drivers/test_arm_and_mill.py."""
 
 
 def test_every_registered_driver_has_a_rig() -> None:

@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 import errno
+import importlib
 import os
 import signal
 import time
+import tomllib
 from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
+import pytest
 from daemon_rig import Daemon, axes, raises, reads, wait_for
 
 import sioms
 
+EXAMPLES = Path(__file__).resolve().parents[2] / "drivers" / "compound"
 COORDINATE = """
 [[device.bridge.axis]]
 name = "{}"
@@ -153,3 +160,38 @@ def test_a_slow_one_stops_what_is_left_without_waiting_for_its_tick(start_daemon
             os.kill(daemon.device("mod1")["pid"], signal.SIGKILL)
             wait_for(lambda: max(map(abs, below.read().velocity)) < 1e-3, "the others halt")
             assert below.read().stamp_ns - ticked_ns < 450_000_000, "a tick would come after half a second"
+
+
+@pytest.mark.parametrize(
+    ("name", "goal", "refused", "why"),
+    [
+        ("arm", [0.3, 0.05, 0.15, 0.3], [0.6, 0.0, 0.15, 0.3], "from the shoulder"),
+        ("mill", [0.03, 0.02, 0.15, 0.2, -0.5], [0.03, 0.02, 0.15, 1.3, -0.5], "a tilt of 1.3 rad"),
+    ],
+)
+def test_arm_and_mill_move_the_simulated_axes_of_their_examples(
+    start_daemon: Callable[..., Daemon], name: str, goal: list[float], refused: list[float], why: str
+) -> None:
+    driver: Any = importlib.import_module(f"sioms.drivers.compound.{name}").DRIVER
+    text = (EXAMPLES / f"{name}.toml").read_text(encoding="utf-8")
+    daemon = start_daemon(text.replace('driver = "sim-axes"', 'driver = "sim-axes"\nlate_max_s = 0.5'))
+    with daemon.cell() as cell:
+        daemon.wait_up(name)
+        with cell.open(name, "rw", timeout=10.0) as node:
+            wait_for(lambda: reads(node), "it has found its axes")
+            with raises(errno.ERANGE, why):
+                _all(node, refused)
+            _all(node, goal)
+            node.wait_until_idle(20.0)
+            wait_for(lambda: np.allclose(node.read().position, goal, atol=2e-4), "it is there")
+            keys = {key: value for key, value in tomllib.loads(text)["device"][name].items() if key != "driver"}
+            joints = driver.transform(msgspec.convert(keys, driver.Settings)).inverse(goal)
+            below = [cell.open(f"{one}.readonly", "r") for one in keys["axes"]]
+            wait_for(
+                lambda: np.allclose([at for one in below for at in one.read().position], joints, atol=5e-4),
+                "its axes are where the map says",
+            )
+
+
+def _all(node: sioms.Node, position: list[float]) -> None:
+    node.write([sioms.command(i, position=at) for i, at in enumerate(position)])
