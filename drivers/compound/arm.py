@@ -40,9 +40,7 @@ class ArmDriver(Compound):
     @classmethod
     def transform(cls, settings: ArmSettings) -> Arm:
         """Return the map."""
-        return Arm(
-            settings.upper_m, settings.fore_m, settings.elbow == "left", settings.bend_rad, settings.facing_rad
-        )
+        return Arm(settings.upper_m, settings.fore_m, settings.elbow == "left", settings.bend_rad, settings.facing_rad)
 
 
 DRIVER = ArmDriver

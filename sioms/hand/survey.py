@@ -43,6 +43,8 @@ MEAN_S, DRAGGED_S = 1.0, 0.3
 about once a second, and a drive that moves bears by its damping what its stiffness does not."""
 DRAG, DRAG_S = 5e-3, 0.6  # speed at which fingers are dragged along a clamped bar [m/s], and for how long first
 EVEN = 0.01  # velocity along the line of centres for a difference of both loads [m/(s N)]
+LEAST_ROWS, LEAST_GRASPS = 30, 10
+"""Rows and grasps below which ``sioms reconcile hand`` judges no records."""
 TRIES = 3  # grasps that fail one after the other
 #: What a hand's devices tell by themselves: x1, y1, th1, x2, y2, th2 as the encoders read them, places, loads, the same
 #: joints as commanded, and the wrists' forces fx1, fy1, fx2, fy2 [m, rad, N]; nan where not known.
@@ -269,6 +271,16 @@ def continued(past: Sequence[Sequence[float]], rows: Sequence[Sequence[float]]) 
     """Return rows after those of the same session before; their time goes on."""
     began = past[-1][0] if past else 0.0
     return [*(list(row) for row in past), *([row[0] + began, *row[1:]] for row in rows)]
+
+
+def missing(rows: int, grasps: int) -> str:
+    """Say what is missing for records that can be judged; empty when nothing is."""
+    more = [
+        f"{least - there} more {what}{'s' if least - there > 1 else ''}"
+        for what, there, least in (("row", rows, LEAST_ROWS), ("grasp", grasps, LEAST_GRASPS))
+        if there < least
+    ]
+    return " and ".join(more)
 
 
 def next_grasp(past: Sequence[Sequence[float]]) -> int:

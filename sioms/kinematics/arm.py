@@ -48,9 +48,9 @@ class Arm:
         """
         shoulder, elbow, lift, wrist = joints
         if not self._sign * math.sin(elbow) >= 0.0:
+            right, wrong = ("left", "right") if self.elbow_left else ("right", "left")
             raise ValueError(
-                f"the elbow is at {elbow:.4g} rad, bent to the {'right' if self.elbow_left else 'left'}; want it on the "
-                f"{'left' if self.elbow_left else 'right'}, as the arm is configured"
+                f"the elbow is at {elbow:.4g} rad, bent to the {wrong}; want it on the {right}, as configured"
             )
         outer = shoulder + elbow
         return (
@@ -73,8 +73,8 @@ class Arm:
         (least, most), distance = self.span_m, math.hypot(x, y)
         if not least <= distance <= most:
             raise ValueError(
-                f"({x:.6g}, {y:.6g}) m is {distance:.6g} m from the shoulder; want {least:.6g} to {most:.6g} m, where the "
-                f"elbow is at least {self.bend_rad:g} rad away from folded and from stretched"
+                f"({x:.6g}, {y:.6g}) m is {distance:.6g} m from the shoulder; want {least:.6g} to {most:.6g} m, where "
+                f"the elbow is at least {self.bend_rad:g} rad away from folded and from stretched"
             )
         shoulder, elbow = self._posture(x, y, distance)
         return shoulder, elbow, lift, angle - shoulder - elbow
@@ -100,11 +100,8 @@ class Arm:
     @property
     def span_m(self) -> tuple[float, float]:
         """Least and largest distance of the wrist's axis from the shoulder's [m]."""
-        folded, stretched = (
-            math.sqrt(self.upper_m**2 + self.fore_m**2 + sign * 2.0 * self.upper_m * self.fore_m * math.cos(self.bend_rad))
-            for sign in (-1.0, 1.0)
-        )  # fmt: skip
-        return folded, stretched
+        squares, twice = self.upper_m**2 + self.fore_m**2, 2.0 * self.upper_m * self.fore_m * math.cos(self.bend_rad)
+        return math.sqrt(squares - twice), math.sqrt(squares + twice)
 
     def _bent(self, distance_m: float) -> float:
         """Return the elbow's angle at a distance within the span [rad]."""

@@ -12,7 +12,7 @@ Five = tuple[float, float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Mill:
-    """Joints (x, y, z [m], tilt, turn [rad]).  Coordinates (x, y, z [m], tilt, turn [rad]) of the tool in the workpiece.
+    """Joints (x, y, z [m], tilt, turn [rad]).  Coordinates: the same, of the tool in the workpiece.
 
     The cradle tilts about an axis parallel to x, the table on it turns about its own normal, z at no tilt; both angles
     are right-handed rotations of the workpiece. x, y and z of the coordinates are of the tool's tip in the frame that

@@ -100,7 +100,7 @@ def run(args: argparse.Namespace) -> int:
     if rows:
         write_whole(args.output, text_of(continued(past, rows)))
     grasps = len({row[1] for row in rows})
-    print(f"{grasps} of {len(plan)} grasps recorded, {len(rows)} rows: {args.output}")
+    print(f"{grasps} of {len(plan)} grasps recorded, {len(rows)} rows: {args.output}{_more([*past, *rows])}")
     return 0 if grasps == len(plan) else 1
 
 
@@ -123,8 +123,16 @@ def _from_recording(args: argparse.Namespace, thing: Thing | None) -> int:
     what = (OTHER, args.thing, math.nan) if thing is None else (thing.kind, thing.number, thing.size_m)
     rows = rows_from(args.recording, what, args.node, args.fingers, args.modules, args.wrists, first)
     write_whole(args.output, text_of(continued(past, rows)))
-    print(f"{len({row[1] for row in rows})} grasps found, {len(rows)} rows: {args.output}")
+    print(f"{len({row[1] for row in rows})} grasps found, {len(rows)} rows: {args.output}{_more([*past, *rows])}")
     return 0
+
+
+def _more(rows: Sequence[Sequence[float]]) -> str:
+    """Say what this recording lacks to be judged by itself."""
+    from sioms.hand.survey import missing
+
+    more = missing(len(rows), len({row[1] for row in rows}))
+    return f"; sioms reconcile hand wants {more}: go on with --append, or record another file beside it" if more else ""
 
 
 def tell(text: str) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from sioms.hand.survey import LEAST_GRASPS, LEAST_ROWS, missing
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.hand.belief import HandBelief, gaps
 from sioms.reconcile.hand.grasps import BAR, DISK, OTHER, Floats, Grasps
 
-LEAST_ROWS, LEAST_GRASPS = 30, 10
 MOST_SIZE_M, MOST_LOAD_N, MOST_PLACE_M = 0.5, 100.0, 10.0
 FAR_M = 0.03
 """By how much contacts may miss their object in the middle of all grasps: more is another unit, sign or finger."""
@@ -21,10 +21,11 @@ def check(g: Grasps, b: HandBelief) -> list[str]:
     Raises:
         BadInputError: with what is wrong and what would be right.
     """
-    if len(g) < LEAST_ROWS or len(np.unique(g.grasp)) < LEAST_GRASPS:
+    grasps = len(np.unique(g.grasp))
+    if more := missing(len(g), grasps):
         raise BadInputError(
-            f"read grasps: {len(g)} rows of {len(np.unique(g.grasp))} grasps are too few; record {LEAST_ROWS} rows of "
-            f"{LEAST_GRASPS} grasps or more"
+            f"read grasps: {len(g)} rows of {grasps} grasps are too few; want {LEAST_ROWS} rows of {LEAST_GRASPS} grasps "
+            f"or more: record {more} (sioms hand record --append, the same day and homing, or another file beside)"
         )
     for name, values, most, unit in (
         ("time", g.time, np.inf, "s"), ("joints", g.joints[:, [0, 1, 3, 4]], MOST_PLACE_M, "m"),

@@ -12,7 +12,9 @@ from pathlib import Path
 
 import sioms
 from sioms.hand.live.surveying import Nodes, surveying
-from sioms.hand.survey import BAR, DISK, LOADS_N, SLIPS_N, Setting, Thing, continued, next_grasp, settings, text_of
+from sioms.hand.survey import (
+    BAR, DISK, LEAST_GRASPS, LOADS_N, SLIPS_N, Setting, Thing, continued, next_grasp, settings, text_of,
+)  # fmt: skip
 from sioms.hand.touch import Failed
 from sioms.lab.stopping import ExperimentStopped
 from sioms.reconcile.errors import BadInputError
@@ -22,7 +24,7 @@ from sioms.reconcile.live.experiments import able as choose
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.whole_file import write_whole
 
-LEAST_GRASPS, HEAVY = 10, (0.5, 1.0, 1.8, 2.8)
+HEAVY = (0.5, 1.0, 1.8, 2.8)
 GRASP_S, DRAG_S = 16.0, 12.0
 """What a grasp under three loads takes, and one in which the fingers are dragged [s]."""
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from sioms.hand import survey
 from sioms.hand.command import record
 from sioms.hand.live.beside import Beside
 from sioms.hand.plane import PlaneHand, Rig
@@ -131,3 +132,9 @@ def test_what_a_simulated_hand_hides_is_read(tmp_path: Path) -> None:
     mounts, turned = record.hidden(tmp_path / "h.toml")
     assert mounts == (Mount(), Mount(link_m=0.142)) and turned == (0.0, 0.026)
     assert record.hidden(None) == ((Mount(), Mount()), (0.0, 0.0))
+
+
+def test_records_that_are_too_few_are_told_by_what_is_missing() -> None:
+    assert survey.missing(21, 7) == "9 more rows and 3 more grasps"
+    assert survey.missing(29, 12) == "1 more row" and survey.missing(36, 9) == "1 more grasp"
+    assert survey.missing(survey.LEAST_ROWS, survey.LEAST_GRASPS) == ""

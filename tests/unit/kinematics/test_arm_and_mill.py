@@ -166,7 +166,8 @@ def test_a_table_that_would_meet_the_spindle_is_refused() -> None:
         (Arm, {"upper_m": 0.1, "fore_m": 0.1, "bend_rad": 1.6}, "bend_rad"),
         (Arm, {"upper_m": 0.1, "fore_m": 0.1, "facing_rad": math.nan}, "facing_rad"),
         (Mill, {"pivot_m": (0.0, math.nan, 0.0)}, "pivot_m"), (Mill, {"table_m": (0.0, math.inf)}, "table_m"),
-        (Mill, {"tool_m": -0.1}, "tool_m"), (Mill, {"tilt_max": 4.0}, "tilt_max"), (Mill, {"tilt_max": 0.0}, "tilt_max"),
+        (Mill, {"tool_m": -0.1}, "tool_m"),
+        (Mill, {"tilt_max": 4.0}, "tilt_max"), (Mill, {"tilt_max": 0.0}, "tilt_max"),
     ],
 )  # fmt: skip
 def test_numbers_that_describe_no_machine_are_refused(kind: Any, keys: dict[str, Any], word: str) -> None:
