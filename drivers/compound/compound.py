@@ -143,7 +143,13 @@ class Compound(TickDriver):
             raise ValueError(f"axis: {', '.join(names) or 'none given'}; want {', '.join(wanted)}, in this order")
         if not settings.axes:
             raise ValueError("axes: none given; want the nodes of the axes that are held")
+        if not 1.0 / settings.tick_hz <= settings.late_max_s < math.inf:
+            raise ValueError(
+                f"late_max_s {settings.late_max_s:g}; want at least a tick, {1 / settings.tick_hz:g} s, finite"
+            )
         for axis in settings.axis:
+            if not (math.isfinite(axis.force_scale) and axis.force_scale):
+                raise ValueError(f"axis {axis.name}: force_scale {axis.force_scale:g}; want a finite number, not 0")
             if not 0.0 < axis.gain <= 0.5 * settings.tick_hz:
                 raise ValueError(
                     f"axis {axis.name}: gain {axis.gain:g}; want above 0 and at most {0.5 * settings.tick_hz:g}"

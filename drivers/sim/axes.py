@@ -65,6 +65,10 @@ class SimAxes(TickDriver):
         """Tell the axes and the plant; reads the effects file, so that its mistakes show before the start."""
         if not settings.axis:
             raise ValueError("axis: none given; want a table [[...axis]] for each axis")
+        if not 1.0 / settings.tick_hz <= settings.late_max_s < math.inf:
+            raise ValueError(
+                f"late_max_s {settings.late_max_s:g}; want at least a tick, {1 / settings.tick_hz:g} s, finite"
+            )
         motors, _, _ = built = build(settings)
         SimAxes._checked = (settings, built)
         if settings.carries and (motors is None or motors.position.size < JOINTS):

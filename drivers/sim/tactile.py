@@ -167,6 +167,11 @@ def _check(settings: SimTactileSettings) -> int:
     for key, values in (("gain", settings.gain), ("offset", settings.offset)):
         if len(values) not in (0, elements):
             raise ValueError(f"{key}: {len(values)} numbers; want {elements}, one for each element")
+    for key in ("noise", "resolution"):
+        if not 0.0 <= getattr(settings, key) < math.inf:
+            raise ValueError(f"{key} {getattr(settings, key):g}; want 0 or more, finite")
+    if not math.isfinite(settings.angle_per_position):
+        raise ValueError(f"angle_per_position {settings.angle_per_position:g}; want a finite number of rad")
     if not (settings.indenter_radius_m >= 0 and math.isfinite(settings.angle_rad)):
         raise ValueError(
             f"indenter_radius_m {settings.indenter_radius_m:g}, angle_rad {settings.angle_rad:g}; "

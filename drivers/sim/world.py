@@ -34,7 +34,7 @@ import msgspec
 from sioms.plant import outline as outlines
 from sioms.plant.carried import most_late
 from sioms.plant.outline import Outline
-from sioms.plant.planar import Body, Finger, Mount, World
+from sioms.plant.planar import RUBBER_PA, Body, Finger, Mount, World
 from sioms.plant.skin import skin
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
@@ -69,6 +69,13 @@ _JOINTS = tuple(
     for what in ("place", "speed", "stiffness", "damping")
     for joint in ("x", "y", "th")
 )
+_MOST_STEPS = 1000
+_FAR_M, _TURNED_RAD = 10.0, 100.0
+_KEYS = {
+    "disk": ("radius_m",), "rectangle": ("size_m", "corner_m"), "ellipse": ("size_m",),
+    "polygon": ("points_m", "corner_m"), "spline": ("points_m",),
+}  # fmt: skip
+"""What describes the outline of each shape; no other shape reads it."""
 _LATE_TICKS = 3
 """How late an axis is seen that ticks no less often, and is held: one tick here, one there, and between them."""
 
@@ -142,14 +149,18 @@ class SimWorld(TickDriver):
     @classmethod
     def describe(cls, name: str, settings: SimWorldSettings) -> Description:
         """Tell the object's pose and what each finger feels."""
-        if not 0.0 < settings.step_s < math.inf:
-            raise ValueError(f"step_s {settings.step_s:g}; want above 0, finite")
+        least_s = 1.0 / (settings.tick_hz * _MOST_STEPS)
+        if not least_s <= settings.step_s < math.inf:
+            raise ValueError(
+                f"step_s {settings.step_s:g}; want at least {least_s:.2g} s, {_MOST_STEPS} steps a tick, finite"
+            )
         _body(settings.object)
         names = [finger.name for finger in settings.finger]
         for index, finger in enumerate(settings.finger):
             if finger.name in (*names[:index], "pose", *(f"{name}_joints" for name in names)):
                 raise ValueError(f"finger {index}: name {finger.name!r} is taken; want another")
             _check(finger, _LATE_TICKS / settings.tick_hz)
+        _follows(settings)
         pose = tuple(ChannelInfo(channel, unit, description="true, of the object") for channel, unit in _POSE)
         felt = tuple(ChannelInfo(channel, unit, description=what) for channel, unit, what in _FINGER)
         blocks = [BlockSpec("pose", NodeClass.ANALOG, pose, history=settings.history)]
@@ -265,14 +276,51 @@ def _check(finger: FingerTable, late_s: float) -> None:
             )
 
 
+def _follows(settings: SimWorldSettings) -> None:
+    """Refuse what is too light for the steps.
+
+    Raises:
+        ValueError: a mass or an inertia, and what would be right.
+    """
+    step_s, rubber = min(settings.step_s, 1.0 / settings.tick_hz), 0.0
+    for finger in settings.finger:
+        mount = from_table(Mount, finger.mount)
+        rubber += RUBBER_PA * mount.length_m
+        for what, given, least in zip(
+            ("mass", "inertia"), (mount.mass, mount.inertia), mount.least_mass(step_s), strict=True
+        ):
+            if given < least:
+                raise ValueError(
+                    f"finger {finger.name}: {what} {given:g} is thrown about by its springs in steps of "
+                    f"{1e3 * step_s:g} ms; want at least {least:.2g}, softer springs, or a shorter step_s"
+                )
+    least = 0.5 * step_s**2 * rubber
+    if settings.object.mass < least:
+        raise ValueError(
+            f"object: mass {settings.object.mass:g} kg is thrown about by the rubber in steps of {1e3 * step_s:g} ms; "
+            f"want at least {least:.2g} kg, or a shorter step_s"
+        )
+
+
 def _body(table: ObjectTable) -> Body:
     """Make the object.
 
     Raises:
         ValueError: an outline that is not convex, or a number out of its range.
     """
-    if not all(map(math.isfinite, table.pose)):
-        raise ValueError(f"describe object: its pose is {list(table.pose)}; want finite numbers")
+    x, y, angle = table.pose
+    if not (max(abs(x), abs(y)) <= _FAR_M and abs(angle) <= _TURNED_RAD):
+        raise ValueError(
+            f"describe object: its pose is {list(table.pose)}; want x and y within {_FAR_M:g} m of 0, on a platen, and "
+            f"an angle within {_TURNED_RAD:g} rad"
+        )
+    usual = ObjectTable(table.shape)
+    for key in sorted({key for keys in _KEYS.values() for key in keys} - set(_KEYS[table.shape])):
+        if getattr(table, key) != getattr(usual, key):
+            raise ValueError(
+                f"describe object: {key} is given, which nobody reads of shape {table.shape}; want "
+                f"{' and '.join(_KEYS[table.shape])}"
+            )
     return Body(_outline(table), table.mass, table.platen_friction)
 
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 Six = tuple[float, float, float, float, float, float]
 
-LINK_M = 0.140
+LINK_M, LONGEST_M = 0.140, 10.0
 COORDINATES = ("x", "y", "psi", "d", "phi1", "phi2")
 UNITS = ("m", "m", "rad", "m", "rad", "rad")
 
@@ -46,8 +46,10 @@ class Hand:
 
     def __post_init__(self) -> None:
         for name in ("link1_m", "link2_m", "least_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"describe hand: {name} is {getattr(self, name)} m; want more than 0, finite")
+            if not 0.0 < getattr(self, name) <= LONGEST_M:
+                raise ValueError(
+                    f"describe hand: {name} is {getattr(self, name)} m; want more than 0, at most {LONGEST_M:g}"
+                )
 
     def forward(self, joints: Sequence[float]) -> Six:
         """Return the hand coordinates of joints; psi and phi within (-pi, pi].

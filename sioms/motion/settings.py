@@ -254,6 +254,9 @@ class AxisSettings:
             raise ValueError(f"axis {self.name}: kp {self.kp:g} makes the law unstable; want between -1 and 1")
         if not 0 <= self.ki < float("inf"):
             raise ValueError(f"axis {self.name}: ki {self.ki:g}; want 0 or more")
+        for name in ("kz", "kb", "force_offset"):
+            if not abs(getattr(self, name)) < float("inf"):
+                raise ValueError(f"axis {self.name}: {name} {getattr(self, name):g}; want a finite number")
         self._check_arrival()
 
     def _check_arrival(self) -> None:

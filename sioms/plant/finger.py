@@ -9,7 +9,7 @@ Conventions: strain positive in tension; the output of an element is compression
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,10 @@ class FingerShape:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        for field_ in fields(self):
+            value = getattr(self, field_.name)
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ValueError(f"build finger: {field_.name} = {value}; want a finite number")
         if not (len(self.angles_rad) > 0 and np.all(np.isfinite(self.angles_rad))):
             raise ValueError(f"build finger: {len(self.angles_rad)} angles_rad; want one or more, all finite")
         for name in (

@@ -105,6 +105,15 @@ class ForceSensor:
         self._has_step = bool(np.all(self._step > 0))
         if not self._has_step and np.any(self._step != 0):
             raise ValueError(f"build force sensor: resolution {self._step}; want all positive or all 0")
+        for what, values, good, want in (
+            ("noise", self._noise, (self._noise >= 0.0) & np.isfinite(self._noise), "0 or more, finite"),
+            ("resolution", self._step, np.isfinite(self._step), "finite numbers"),
+            ("bias", self.bias, np.isfinite(self.bias), "finite numbers"),
+            ("limit", self._limit, self._limit > 0.0, "more than 0"),
+            ("what contacts do", self._wrenches, np.isfinite(self._wrenches), "finite directions and points"),
+        ):
+            if not np.all(good):
+                raise ValueError(f"build force sensor: {what} {values.tolist()}; want {want}")
         self._random = np.random.default_rng(seed)
         self._work = np.zeros(6)
 

@@ -69,6 +69,14 @@ class Outline:
         """Return the distance of the farthest point from the centroid [m]."""
         return float(np.hypot(self.points[:, 0], self.points[:, 1]).max())
 
+    @property
+    def narrowest_m(self) -> float:
+        """Return the least width [m]: across a side; of outlines of many sides the least of 360 of them."""
+        side = np.roll(self.points, -1, axis=0) - self.points
+        some = side[:: max(1, len(side) // 360)]
+        across = np.stack([some[:, 1], -some[:, 0]]) / np.hypot(some[:, 0], some[:, 1])
+        return float(np.min(np.ptp(self.points @ across, axis=0)))
+
     def width(self, direction: float) -> float:
         """Return the width [m] between the two supporting lines whose normal has this direction [rad]."""
         along = self.points @ np.array([math.cos(direction), math.sin(direction)])

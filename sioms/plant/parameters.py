@@ -124,6 +124,16 @@ def check_motors(motors: Sequence[Motor], tick_s: float) -> None:
                 f"{where}: force_max {motor.force_max:g}, encoder_step {motor.encoder_step:g}, "
                 f"index_pitch {motor.index_pitch:g}; want positive, at least 0, positive"
             )
+        if not (math.isfinite(motor.start) and math.isfinite(motor.load_force) and motor.encoder_step < math.inf):
+            raise ValueError(
+                f"{where}: start {motor.start:g}, load_force {motor.load_force:g}, encoder_step "
+                f"{motor.encoder_step:g}; want finite numbers"
+            )
+        if not (0 <= motor.force_constant < math.inf and 0 <= motor.resistance_ohm < math.inf and motor.supply_v > 0):
+            raise ValueError(
+                f"{where}: force_constant {motor.force_constant:g} N/A, resistance_ohm {motor.resistance_ohm:g}, "
+                f"supply_v {motor.supply_v:g}; want at least 0, at least 0, positive"
+            )
         wall = motor.wall
         if wall is not None and not (wall.stiffness > 0 and wall.damping >= 0 and abs(wall.side) == 1):
             raise ValueError(

@@ -32,6 +32,19 @@ GRAVITY = 9.80665
 LOST = math.inf
 
 
+FARTHEST_M, NARROWEST_M = 0.72, 1e-3
+"""Of an object: how far it may reach from its centroid, and how wide it must be at least [m]."""
+_MOUNTS = {
+    "link_m": (0.0, 10.0), "stiffness": (1e-12, 1e10), "turn_stiffness": (1e-12, 1e8), "mass": (1e-6, 1e7),
+    "inertia": (1e-9, 1e6), "damping_ratio": (0.0, 1e3), "length_m": (1e-4, 1.0), "friction": (0.0, 100.0),
+    "loss_s": (0.0, 1e4), "shear_loss_s": (0.0, 10.0),
+}  # fmt: skip
+RUBBER_PA = 1.5e6
+"""Stiffness of a contact for each metre along the finger at 500 N/m, on a flat [N/m^2]; steps are to follow that."""
+_BODIES = {"mass": (1e-6, 1e12), "platen_friction": (0.0, 1e3)}
+"""Bounds of numbers that measure a hand; masses and times are those of slow motion, too (`sioms.hand.slow`)."""
+
+
 @dataclass(frozen=True, slots=True)
 class Mount:
     """Carry a finger: a module's joints and the finger on its link.
@@ -64,6 +77,14 @@ class Mount:
     shear_loss_s: float = 3e-4
     creep: bool = True
 
+    def least_mass(self, step_s: float) -> tuple[float, float]:
+        """Return mass [kg] and inertia [kg m^2] below which springs and rubber outrun steps of this length.
+
+        Springs are integrated explicitly: from a frequency of 2/step on they gain energy. This asks for half of it.
+        """
+        rubber = RUBBER_PA * self.length_m
+        return step_s**2 * (self.stiffness + rubber), step_s**2 * (self.turn_stiffness + rubber * self.link_m**2)
+
     @property
     def springs(self) -> tuple[tuple[float, float, float], ...]:
         """Stiffness and damping of x, y [N/m, N s/m] and th [N m/rad, N m s/rad], and the mass behind each."""
@@ -75,20 +96,16 @@ class Mount:
         )  # fmt: skip
 
     def __post_init__(self) -> None:
-        for name in ("stiffness", "turn_stiffness", "mass", "inertia", "length_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"describe finger's mount: {name} is {getattr(self, name)}; want more than 0, finite")
-        for name in ("link_m", "damping_ratio", "loss_s", "shear_loss_s"):
-            if not 0.0 <= getattr(self, name) < math.inf:
-                raise ValueError(f"describe finger's mount: {name} is {getattr(self, name)}; want 0 or more, finite")
-        if self.friction is not None and not 0.0 <= self.friction < math.inf:
-            raise ValueError(f"describe finger's mount: friction is {self.friction}; want 0 or more, finite")
-        loads = [load for load, _ in self.friction_by_load]
-        odd = loads != sorted(set(loads)) or not all(0.0 <= factor < math.inf for _, factor in self.friction_by_load)
-        if odd or not all(map(math.isfinite, loads)):
+        for name, (least, most) in _MOUNTS.items():
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
+                raise ValueError(f"describe finger's mount: {name} is {value:g}; want {least:g} to {most:g}")
+        loads, most = [load for load, _ in self.friction_by_load], _MOUNTS["friction"][1]
+        odd = loads != sorted(set(loads)) or not all(0.0 <= factor <= most for _, factor in self.friction_by_load)
+        if odd or not all(0.0 <= load < math.inf for load in loads):
             raise ValueError(
-                f"describe finger's mount: friction_by_load is {self.friction_by_load}; want forces that rise, "
-                "each with a factor of 0 or more"
+                f"describe finger's mount: friction_by_load is {self.friction_by_load}; want forces of 0 or more that "
+                f"rise, each with a factor of 0 or more, at most {most:g}"
             )
 
     def coefficient(self, radius_m: float, normal: float) -> float:
@@ -153,10 +170,21 @@ class Body:
     platen_friction: float = 0.2
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.mass < math.inf:
-            raise ValueError(f"describe object: mass is {self.mass} kg; want more than 0, finite")
-        if not 0.0 <= self.platen_friction < math.inf:
-            raise ValueError(f"describe object: platen_friction is {self.platen_friction}; want 0 or more, finite")
+        for name, (least, most) in _BODIES.items():
+            value = getattr(self, name)
+            if not least <= value <= most:
+                raise ValueError(f"describe object: {name} is {value:g}; want {least:g} to {most:g}")
+        reach, narrow = self.outline.reach_m, self.outline.narrowest_m
+        if not reach <= FARTHEST_M:
+            raise ValueError(
+                f"describe object: it reaches {reach:.3g} m from its centroid; want at most {FARTHEST_M:g} m, which a "
+                "platen of 0.8 m by 1.2 m holds"
+            )
+        if not narrow >= NARROWEST_M:
+            raise ValueError(
+                f"describe object: it is {narrow:.3g} m wide where it is narrowest; want at least {NARROWEST_M:g} m, "
+                "or rubber fingers would touch each other round it"
+            )
 
 
 class World:

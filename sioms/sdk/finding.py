@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import importlib.util
+import math
 import os
 import stat
 import sys
@@ -26,6 +27,8 @@ from .driver import Driver, LineDriver, StreamDriver, TickDriver
 from .registry import Point, entry_points
 
 GROUP = "sioms.drivers"
+MOST_NUMBER = 1e15
+"""Beyond it no number of a configuration measures anything, and squares of such numbers overflow."""
 
 
 class DriverNotFound(Exception):
@@ -105,16 +108,26 @@ def read_settings(driver: type[Driver], table: Mapping[str, Any], folder: str) -
     """
     kind = driver.Settings
     table = dict(_anchored(table, folder))
-    errors = []
+    odd = list(_odd_numbers(table))
+    errors = list(odd)
     # The validator names one error; all are looked for only when there is one.
     top = kind.__struct_encode_fields__
     for key in [k for k in table if k not in top]:
         errors.append(f": unknown key {key}{did_you_mean(key, top)}")
         del table[key]
     try:
-        return msgspec.convert(table, kind), errors
+        return None if odd else msgspec.convert(table, kind), errors
     except msgspec.ValidationError as error:
         return None, errors + (every_error("", table, kind) or [explain("", error, field_names(kind), choices(kind))])
+
+
+def _odd_numbers(value: Any, path: str = "") -> Iterator[str]:
+    """Yield the numbers that measure nothing, in nested tables too: drivers compare with them, and NaN passes by."""
+    if isinstance(value, Mapping | list):
+        for key, each in value.items() if isinstance(value, Mapping) else enumerate(value):
+            yield from _odd_numbers(each, f"{path}[{key}]" if isinstance(value, list) else f"{path}.{key}")
+    elif isinstance(value, float) and (math.isnan(value) or MOST_NUMBER < abs(value) < math.inf):
+        yield f"{path}: {value:g}; want a number" + ("" if math.isnan(value) else f" of at most {MOST_NUMBER:g}")
 
 
 def _anchored(value: Any, folder: str, key: str = "") -> Any:
@@ -208,13 +221,18 @@ def describe(
         settings: its settings.
         made_of: see ``contents``; a device whose files have changed is another one.
     """
+    stated_hz = getattr(settings, "tick_hz", None)
+    if stated_hz is not None and (wrong := _rate_error(stated_hz)):  # drivers divide by it
+        return None, [wrong]
     try:
         description = driver.describe(name, settings)
     except (ValueError, OSError) as error:
         return None, [f": {line}" for line in str(error).splitlines()]
+    except ArithmeticError as error:
+        return None, [f": a number is far out of its range ({error}); want numbers of a machine"]
     errors = _block_errors(description.blocks)
-    if not 0.1 <= description.tick_hz <= 20_000:
-        errors.append(f": rate {description.tick_hz:g} Hz; want 0.1 to 20000")
+    if wrong := _rate_error(description.tick_hz):
+        errors.append(wrong)
     blocks = [
         [
             b.name, int(b.node_class), [c.pack() for c in b.channels],
@@ -228,6 +246,10 @@ def describe(
         made_of, _cost_kind(variant), variant.realtime_priority, list(description.holds),
     ]  # fmt: skip
     return facts, errors
+
+
+def _rate_error(tick_hz: float) -> str:
+    return "" if 0.1 <= tick_hz <= 20_000 else f": rate {tick_hz:g} Hz; want 0.1 to 20000"
 
 
 def kind_of(driver: type[Driver]) -> str:

@@ -13,7 +13,17 @@ from pathlib import Path
 import sioms
 from sioms.hand.live.surveying import Nodes, surveying
 from sioms.hand.survey import (
-    BAR, DISK, LEAST_GRASPS, LOADS_N, SLIPS_N, Setting, Thing, continued, next_grasp, settings, text_of,
+    BAR,
+    DISK,
+    LEAST_GRASPS,
+    LOADS_N,
+    SLIPS_N,
+    Setting,
+    Thing,
+    continued,
+    next_grasp,
+    settings,
+    text_of,
 )  # fmt: skip
 from sioms.hand.touch import Failed
 from sioms.lab.stopping import ExperimentStopped

@@ -1,5 +1,6 @@
 """The simulated plane as a device: axes press on an object in it, and everybody feels the same contact."""
 
+import dataclasses
 import math
 
 import msgspec
@@ -11,13 +12,16 @@ from sioms.drivers.sim.force import SimForce
 from sioms.drivers.sim.tactile import SimTactile
 from sioms.drivers.sim.world import SimWorld
 from sioms.plant.finger import FingerShape, TactileArray
-from sioms.plant.outline import rectangle
+from sioms.plant.outline import disk, rectangle
 from sioms.plant.planar import Body, Mount, World
 from sioms.protocol.flags import AnalogStatus, ControlMode
 from sioms.sdk.exchange import LinkError
 
 RB = 12.7e-3
 MOUNT = {"link_m": 0.0, "stiffness": 1e5, "turn_stiffness": 5.0, "mass": 0.3, "inertia": 2e-4}
+
+BOX = {"shape": "rectangle", "radius_m": 0.0}
+UNBOUNDED = ("friction_by_load", "creep")
 
 
 def module(loads=True):
@@ -150,17 +154,70 @@ def test_a_finger_that_takes_all_round_objects_shows_each_as_its_own_table_would
     ("change", "wrong"),
     [
         ({"shape": "disk", "radius_m": 0.0}, "half_x_m"),
-        ({"shape": "polygon", "points_m": [[0, 0], [0, 0.01], [0.01, 0]]}, "anti-clockwise"),
-        ({"shape": "rectangle", "size_m": [0.02, 0.03], "corner_m": 0.02}, "nothing of a side"),
-        ({"mass": 0.0}, "mass"),
+        ({"radius_m": 5.0}, r"reaches 5 m .* at most 0.72 m"),
+        ({"radius_m": 4e-4}, r"m wide .* at least 0.001 m"),
+        ({**BOX, "size_m": [0.03, 9e-4]}, "0.0009 m wide"),
+        ({**BOX, "size_m": [1.5, 0.03]}, "reaches 0.75 m"),
+        ({"shape": "polygon", "points_m": [[0, 0], [0, 0.01], [0.01, 0]], "radius_m": 0.0}, "anti-clockwise"),
+        ({**BOX, "size_m": [0.02, 0.03], "corner_m": 0.02}, "nothing of a side"),
+        ({"corner_m": 1e-3}, "corner_m is given, which nobody reads of shape disk; want radius_m"),
+        ({**BOX, "size_m": [0.02, 0.03], "radius_m": math.nan}, "radius_m is given, .* want size_m and corner_m"),
+        ({"mass": 0.0}, "mass is 0; want 1e-06 to 1e.12"),
+        ({"mass": 3e-4}, "thrown about by the rubber in steps of 0.25 ms; want at least 0.00094 kg"),
+        ({"mass": 1e13}, "mass is 1e.13; want"),
+        ({"platen_friction": -0.1}, "platen_friction"),
+        ({"platen_friction": 1e6}, "platen_friction"),
         ({"pose": [math.nan, 0.0, 0.0]}, "its pose is"),
-        ({"pose": [0.0, 0.0, math.inf]}, "want finite numbers"),
+        ({"pose": [0.0, 11.0, 0.0]}, "within 10 m"),
+        ({"pose": [0.0, 0.0, math.inf]}, "within 100 rad"),
     ],
 )
 def test_objects_that_cannot_be_are_refused(change, wrong):
     table = world(**change)
     with pytest.raises(ValueError, match=wrong):
         SimWorld.describe("world", msgspec.convert(table, SimWorld.Settings))
+
+
+@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Mount) if field.name not in UNBOUNDED])
+def test_no_number_of_a_mount_is_without_bounds(name):
+    for number in (-1.0, 1e12, math.inf, -math.inf, math.nan):
+        table = world()
+        table["finger"][0]["mount"] = MOUNT | {name: number}
+        with pytest.raises(ValueError, match=rf"{name} is .*; want \S+ to \S+"):
+            SimWorld.describe("world", msgspec.convert(table, SimWorld.Settings))
+
+
+def test_what_is_too_light_for_the_steps_is_refused_and_would_be_thrown_about():
+    """0.1 g between two fingers in steps of 0.25 ms goes off at 10 m/s and more."""
+
+    def speed(mass, step_s):
+        joints = [[-0.0327, 0.14, -0.5 * math.pi], [0.0327, -0.14, 0.5 * math.pi]]
+        mounts = [Mount(stiffness=2.5e4, turn_stiffness=3.0, mass=0.2, inertia=2e-4)] * 2
+        plane = World(Body(disk(0.02), mass), mounts, joints)
+        closed = [[x - math.copysign(2e-3, x), y, th] for x, y, th in joints]
+        plane.command(closed, 0.05)
+        plane.advance(0.05, round(0.05 / step_s))
+        plane.command(closed, 0.05)
+        plane.advance(0.05, round(0.05 / step_s))
+        return math.hypot(*plane.speed[:2])
+
+    assert speed(1e-4, 0.25e-3) > 10.0 and speed(2e-3, 0.25e-3) < 1e-3 and speed(1e-3, 0.1e-3) < 1e-3
+    for mount, wrong in (
+        ({"stiffness": 1e8}, "mass 0.3 is thrown about by its springs .* want at least 6"),
+        ({"turn_stiffness": 1e5}, "inertia 0.0002 is thrown about"),
+    ):
+        table = world()
+        table["finger"][0]["mount"] = MOUNT | {"damping_ratio": 100.0} | mount
+        with pytest.raises(ValueError, match=wrong):
+            SimWorld.describe("world", msgspec.convert(table, SimWorld.Settings))
+
+
+@pytest.mark.parametrize(("keys", "wrong"), [
+    ({"step_s": 0.0}, "step_s 0; want"), ({"step_s": 1e-12}, "1000 steps a tick"), ({"step_s": math.inf}, "step_s inf"),
+])  # fmt: skip
+def test_steps_that_no_tick_could_make_are_refused(keys, wrong):
+    with pytest.raises(ValueError, match=wrong):
+        SimWorld.describe("world", msgspec.convert(world() | keys, SimWorld.Settings))
 
 
 def test_names_of_fingers_are_one_each_and_steppers_bear_no_loads():
@@ -283,7 +340,7 @@ def test_bent_links_push_no_module_that_is_let_go(bench, carrying):
 
 
 def test_a_world_that_ticks_seldom_keeps_its_time(bench):
-    table = world() | {"tick_hz": 10.0, "step_s": 2.5e-3}
+    table = world() | {"tick_hz": 10.0, "step_s": 1e-3}
     table["finger"][0] |= {"axes": ["", "", ""], "mount": MOUNT | {"damping_ratio": 50.0}}
     plane = bench.make(SimWorld, "world", table)
     bench.run(2.0)

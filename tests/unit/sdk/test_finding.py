@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 import pytest
 
 from sioms.sdk import fork_server
-from sioms.sdk.finding import DriverNotFound, contents, find_driver, missing_files, read_settings
+from sioms.sdk.finding import DriverNotFound, contents, describe, find_driver, missing_files, read_settings
 
 FILE = """
 from __future__ import annotations
@@ -114,3 +115,27 @@ def test_a_reload_hears_of_a_deleted_file_before_the_device_that_runs_ends(tmp_p
     (tmp_path / "own.py").write_text(FILE.replace("    line:", "    table_file: str\n    line:"))
     table = {"table_file": "gone.csv", "line": {"tcp": "localhost:1"}}
     assert "table_file = " in fork_server._describe("d", "own.py", table, str(tmp_path))[0][0]
+
+
+@pytest.mark.parametrize(("value", "words"), [
+    (math.nan, ".noise: nan; want a number"), (-1e16, ".noise: -1e+16; want a number of at most 1e+15"),
+    (0.1, ""), (1e15, ""),
+])  # fmt: skip
+def test_numbers_that_measure_nothing_are_refused_for_every_driver(value: float, words: str) -> None:
+    settings, errors = read_settings(find_driver("sim-tactile", "/"), {"noise": value}, "/")
+    assert errors == ([words] if words else []) and (settings is None) == bool(words)
+    table = {"contact": [{"node": "a.b", "direction": [1.0, value, 0.0]}]}
+    settings, errors = read_settings(find_driver("sim-force", "/"), table, "/")
+    assert errors == ([words.replace(".noise", ".contact[0].direction[1]")] if words else [])
+
+
+@pytest.mark.parametrize("name", ["sim-world", "sim-axes", "sim-tactile", "hand"])
+@pytest.mark.parametrize("rate", [0.0, -5.0, math.inf, 1e9])
+def test_a_rate_that_is_none_is_refused_before_anything_is_divided_by_it(name: str, rate: float) -> None:
+    driver = find_driver(name, "/")
+    thing = {"object": {"shape": "disk", "radius_m": 0.02}, "finger": []} if name == "sim-world" else {}
+    axes = {"axes": [], "axis": []} if name == "hand" else {"axis": []} if name == "sim-axes" else {}
+    settings, errors = read_settings(driver, {**thing, **axes, "tick_hz": rate}, "/")
+    assert not errors
+    facts, errors = describe(driver, "it", settings)
+    assert facts is None and errors == [f": rate {rate:g} Hz; want 0.1 to 20000"]
