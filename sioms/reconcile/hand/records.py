@@ -25,7 +25,7 @@ def check(g: Grasps, b: HandBelief) -> list[str]:
     if more := missing(len(g), grasps):
         raise BadInputError(
             f"read grasps: {len(g)} rows of {grasps} grasps are too few; want {LEAST_ROWS} rows of {LEAST_GRASPS} "
-            f"grasps or more: record {more} (sioms hand record --append, the same day and homing, or another file beside)"
+            f"grasps or more: record {more} (sioms hand record --append, or another file)"
         )
     for name, values, most, unit in (
         ("time", g.time, np.inf, "s"), ("joints", g.joints[:, [0, 1, 3, 4]], MOST_PLACE_M, "m"),
