@@ -18,6 +18,8 @@ from typing import Any
 SLOWEST = 0.01
 PROCESS = "simulation"
 """In which all simulated devices of a slowed cell are: on a busy machine most of a tick is to be woken for it."""
+_FOLLOWS_S, _JITTER_S = 0.5, 0.01
+"""What velocity_max covers in these times an axis may be behind, and be pushed, that says nothing else."""
 Table = dict[str, Any]
 
 _AXIS = {
@@ -73,6 +75,7 @@ def slowed(tables: Mapping[str, Any], pace: float, folder: Path) -> Table:
         models = [axis.get("model_file") for axis in _axes(device)]
         if any(models) or device.get("effects") or device.get("effects_file"):
             raise ValueError(f"slow cell: device {name} has effects, whose times stay; want none")
+        _keep_limits(device)
         _scale(device, powers, pace)
         if device["driver"].startswith("sim-"):
             device.setdefault("process", PROCESS)
@@ -83,6 +86,14 @@ def slowed(tables: Mapping[str, Any], pace: float, folder: Path) -> Table:
 def _axes(device: Table) -> list[Table]:
     axes = device.get("axis", [])
     return axes if isinstance(axes, list) else []
+
+
+def _keep_limits(device: Table) -> None:
+    """Say how far axes may be behind and be pushed, which else go with their velocities: forces bend as far as ever."""
+    for axis in _axes(device):
+        fastest = axis.get("velocity_max", 1.0)
+        axis.setdefault("following_error_max", _FOLLOWS_S * fastest)
+        axis["watch"] = {"tolerance": _JITTER_S * fastest, **axis.get("watch", {})}
 
 
 def _scale(table: Table, powers: Mapping[str, Any], pace: float) -> None:

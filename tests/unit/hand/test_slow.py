@@ -13,6 +13,9 @@ from hand_cell_rig import HandCell, write
 
 from sioms.hand.follow import D
 from sioms.hand.slow import slowed, toml
+from sioms.motion.law import ControlLaw
+from sioms.motion.settings import AxisSettings, Watch
+from sioms.motion.watch import tolerance_of
 
 ETC = Path(__file__).resolve().parents[3] / "etc"
 
@@ -42,6 +45,23 @@ def test_what_is_written_is_what_was_made() -> None:
 def test_one_pace_goes_on_top_of_another() -> None:
     once, twice = slowed(_tables(), 0.125, ETC), slowed(slowed(_tables(), 0.5, ETC), 0.25, ETC)
     assert toml(once) == toml(twice)  # powers of two are exact
+
+
+@pytest.mark.parametrize("pace", [0.3, 0.1])
+def test_in_slow_motion_axes_may_be_behind_and_be_pushed_as_far_as_ever(pace: float) -> None:
+    """A force bends a link as far at any pace: at 0.1 a roll with what is held came to 0.09 rad of 0.1."""
+
+    def limits(pace: float) -> list[float]:
+        found: list[float] = []
+        for table in (slowed(_tables(), pace, ETC) if pace < 1.0 else _tables())["device"].values():
+            for axis in table.get("axis", []):
+                told = {key: axis[key] for key in ("velocity_max", "following_error_max") if key in axis}
+                settings = AxisSettings(axis["name"], k=1.0, watch=Watch(**axis.get("watch", {})), **told)
+                law = ControlLaw([settings], 1e-3)
+                found += [float(law.arrays["error_max"][0]), tolerance_of(settings)]
+        return found
+
+    assert limits(pace) == pytest.approx(limits(1.0), rel=1e-9)
 
 
 def _closing(pace: float) -> list[tuple[float, ...]]:
