@@ -118,6 +118,10 @@ class FingerData:
         rows.append(np.zeros(len(t)))
         return np.concatenate(rows)
 
+    def independent(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the blocks, and no columns: what is projected out is told by many of them, or by one alone."""
+        return self.block, np.zeros((len(self.block), 0))
+
     def whiten(self, change: Floats) -> Floats:
         """Split touches into profile and strength, and project out the nuisances, shape (n,) or (n, k)."""
         flat = change.ndim == 1

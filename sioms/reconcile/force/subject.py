@@ -74,6 +74,10 @@ class ForceData:
         """Predicted less measured, the zero of every record projected out."""
         return self.whiten(predicted - (self.measured / self.sigma)[self.which].T.ravel())
 
+    def independent(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the blocks, and no columns: what is projected out is told by many of them, or by one alone."""
+        return self.block, np.zeros((len(self.block), 0))
+
     def whiten(self, change: Floats) -> Floats:
         """Take the mean of every record and component off, shape (n,) or (n, k)."""
         c = change.reshape(len(self.views), int(self.which.sum()), -1)

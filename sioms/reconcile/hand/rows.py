@@ -102,6 +102,10 @@ class HandData:
         softer = replace(b, soft=b.soft * (1.0 + SOFT))
         return np.asarray((self.gathered(softer, self.grasps) - self.gathered(b, self.grasps)) / self.sigma)[:, None]
 
+    def independent(self) -> tuple[NDArray[np.int64], Floats]:
+        """Return the grasp of each row: its rows of all views are of the same readings; and what is fitted along."""
+        return np.unique(self.grasps.grasp[self.row], return_inverse=True)[1], self.along
+
     def with_sigma(self, sigma: Floats) -> HandData:
         """Return the rows with another noise."""
         along = orthonormal(self.along * (self.sigma / sigma)[:, None])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,6 +60,12 @@ class Data(Protocol):
         """Return a change of the prediction as ``miss`` sees it, shape (n,) or (n, k)."""
         ...
 
+    def independent(self) -> tuple[NDArray[np.int64], Array]:
+        """Return which rows have errors in common, a number from 0 for each, shape (n,), and the changes of the rows with
+        what ``miss`` projects out, shape (n, k).
+        """
+        ...
+
 
 def ratios(data: Data, model: SensorModel) -> Array:
     """Return the root mean square of each view in units of its floor."""
@@ -86,7 +92,25 @@ def half_intervals(data: Data, fit: Fit, weights: Array) -> Array:
     doubts = weights[:, None] * data.whiten(data.doubts(fit.model))
     moved = np.linalg.lstsq(fit.jacobian, doubts, rcond=1e-10)[0]
     size = np.array([f.scale for f in fit.free])
-    return np.asarray(size * np.hypot(intervals(fit, data.block), 1.96 * np.linalg.norm(moved, axis=1)))
+    ids, beside = data.independent()
+    spread = intervals(*_with(fit, ids, weights[:, None] * beside))[: len(size)]
+    return np.asarray(size * np.hypot(spread, 1.96 * np.linalg.norm(moved, axis=1)))
+
+
+class _Whole(NamedTuple):
+    residual: Array
+    jacobian: Array
+
+
+def _with(fit: Fit, ids: NDArray[np.int64], beside: Array) -> tuple[_Whole, NDArray[np.int64]]:
+    """Return a fit in which what is projected out is free as well, in the order of its blocks.
+
+    Blocks that are left out tell of those numbers, too: projected out once of all, what is free looks as if it knew them.
+    """
+    order = np.argsort(ids, kind="stable")
+    basis = np.linalg.qr(beside)[0]
+    residual, jacobian = (v - basis @ (basis.T @ v) for v in (fit.residual, fit.jacobian))
+    return _Whole(residual[order], np.concatenate([jacobian, basis], axis=1)[order]), ids[order]
 
 
 def free_numbers(model: SensorModel, frozen: Sequence[str] = ()) -> tuple[Free, ...]:
