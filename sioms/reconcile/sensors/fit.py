@@ -61,8 +61,8 @@ class Data(Protocol):
         ...
 
     def independent(self) -> tuple[NDArray[np.int64], Array]:
-        """Return which rows have errors in common, a number from 0 for each, shape (n,), and the changes of the rows with
-        what ``miss`` projects out, shape (n, k).
+        """Return which rows have errors in common, a number from 0 for each, shape (n,), and the changes of the rows
+        with what ``miss`` projects out, shape (n, k).
         """
         ...
 
@@ -105,7 +105,7 @@ class _Whole(NamedTuple):
 def _with(fit: Fit, ids: NDArray[np.int64], beside: Array) -> tuple[_Whole, NDArray[np.int64]]:
     """Return a fit in which what is projected out is free as well, in the order of its blocks.
 
-    Blocks that are left out tell of those numbers, too: projected out once of all, what is free looks as if it knew them.
+    Blocks that are left out tell of those numbers, too: projected out of all at once, the others seem to know them.
     """
     order = np.argsort(ids, kind="stable")
     basis = np.linalg.qr(beside)[0]
