@@ -18,6 +18,7 @@ from sioms.client.keys import Folder
 from sioms.client.wall import wall
 from sioms.descriptors import permit_files
 from sioms.ending import on_end
+from sioms.heaps import one_heap
 from sioms.notify import ServiceManager
 from sioms.protocol.clock import Wall
 from sioms.protocol.text import printable
@@ -228,6 +229,7 @@ def serve(path: str, folder: Folder, *, zmq: tuple[str, int] | None, zenoh: tupl
         OSError: with a sentence: a place that is taken or not ours, no certificate.
     """
     permit_files()
+    one_heap()
     gateway = Serve(path, folder)
     with closing(gateway):
         if zmq is not None:
