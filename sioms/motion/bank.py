@@ -327,6 +327,12 @@ class Bank(ABC):
         self._recover(chosen, latched)
         self._show(chosen)
 
+    def forget_settings(self, axes: AxesLike) -> None:
+        """End what commands of these halted axes have set for those that follow: who set it has gone."""
+        chosen = self._forget(axes)
+        self._queue.forget_settings(chosen)
+        self._settings_forgotten(chosen)
+
     def _abandon(self, axes: Axes, now_ns: int, errno_: int, text: str, *, fastest: bool = False) -> None:
         """Stop axes for a reason that is not their writer's, and tell those who wait for them."""
         self._forget(axes)
@@ -481,6 +487,9 @@ class Bank(ABC):
 
     def _forget_places(self, axes: Axes) -> None:  # noqa: B027  # most loops have nothing to do
         """These axes do not know where they are."""
+
+    def _settings_forgotten(self, axes: Axes) -> None:  # noqa: B027  # most loops have nothing to do
+        """What commands have set on these axes has ended."""
 
     def _limits_changed(self, axes: Axes) -> None:  # noqa: B027  # most loops have nothing to do
         """Limits of these axes were set."""

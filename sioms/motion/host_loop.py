@@ -218,6 +218,9 @@ class AxisBank(Bank):
     def _show(self, axes: Axes) -> None:
         self._sequencer.refresh(axes)
 
+    def _settings_forgotten(self, axes: Axes) -> None:
+        self._law.forget(axes)
+
     def _limits_changed(self, axes: Axes) -> None:
         held = self._queue.limits
         self._law.velocity_limit[axes] = held.velocity[axes]

@@ -124,8 +124,9 @@ class ControlLaw:
 
     def configure_force(self, axes: NDArray[np.int64], most: Vector) -> None:
         """Set the greatest force of axes anew, for commands and stops [N or N*m]."""
-        self._configured[FORCE_ROW, axes] = most
-        self._command(axes, FORCE_ROW, most)
+        self._configured[FORCE_ROW, axes] = self._commanded[FORCE_ROW, axes] = most
+        braced = self._braced[axes]
+        self._put(axes, np.where(braced, self._configured[:, axes], self._commanded[:, axes]), braced)
 
     def command_force(self, axis: int, most: float) -> None:
         """Put the greatest force of a command in force [N or N*m]."""
@@ -143,11 +144,11 @@ class ControlLaw:
         self._commanded[rows, axes] = values
         self._put(axes, self._commanded[:, axes])
 
-    def _put(self, axes: NDArray[np.int64], values: Vector) -> None:
+    def _put(self, axes: NDArray[np.int64], values: Vector, braced: NDArray[np.bool_] | bool = False) -> None:
         for array, row in zip(self._in_force, values, strict=True):
             array[axes] = row
         self.tuned[axes] = (values != self._configured[:, axes]).any(axis=0)
-        self._braced[axes] = False
+        self._braced[axes] = braced
         self.any_braced = bool(self._braced.any())
         self._limit_force(axes)
 
@@ -156,6 +157,11 @@ class ControlLaw:
         braced = axes[self._braced[axes]]
         if braced.size:
             self._put(braced, self._commanded[:, braced])
+
+    def forget(self, axes: NDArray[np.int64]) -> None:
+        """Commands have set nothing on these axes, which have been halted."""
+        self._commanded[:, axes] = self._configured[:, axes]
+        self._put(axes, self._configured[:, axes])
 
     def brace(self, axes: NDArray[np.int64]) -> Vector:
         """Put what is configured in force, until a command begins; return where the axes are to be held or braked from.
@@ -170,13 +176,12 @@ class ControlLaw:
             return position
         chosen, velocity = axes[tuned], velocity[tuned]
         moves, allowed = self.moves(chosen), self.force_limit[chosen].copy()
-        self._put(chosen, self._configured[:, chosen])
+        self._put(chosen, self._configured[:, chosen], True)
         in_force = self.kind[chosen] == FORCE  # which is bounded by what was asked, when it ends
         toward = np.where(moves, velocity, self.output[chosen])
         held_back = (allowed < self.force_limit[chosen]) & (toward != 0.0) & ~in_force
         for i in np.flatnonzero(held_back).tolist():
             self.force_ends.hold_back(int(chosen[i]), float(toward[i]), float(allowed[i]))
-        self._braced[chosen] = self.any_braced = True
         self.give_way(chosen)
         servo = ~self.stepper[chosen] & ~in_force
         chosen, velocity, moves = chosen[servo], velocity[servo], moves[servo]

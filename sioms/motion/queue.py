@@ -406,6 +406,10 @@ class CommandQueue:
         for array, axis, value in changes:
             array[axis] = value
         self._limits_set += 1
+        self.forget_settings(axes)
+
+    def forget_settings(self, axes: NDArray[np.int64]) -> None:
+        """What commands of these axes have set as their greatest velocity and acceleration ends."""
         self.in_force[0][axes] = self.limits.velocity[axes]
         self.in_force[1][axes] = self.limits.acceleration[axes]
         self.forget_tail(axes)

@@ -342,6 +342,8 @@ class Attachments:
             self._service.pages.subscribers(handle.block).remove(handle)
         self._service.waits.forget(handle)
         self._halt_all([handle])
+        if handle.exclusive and isinstance(handle.block, AxisBlock):
+            handle.block.bank.forget_settings(sorted(handle.axes))
         handle.close()
         self._tell(Detached(handle.number))
 

@@ -207,6 +207,37 @@ def test_a_narrowed_acceleration_does_not_lengthen_the_end_of_a_force(stop: str)
     assert plant.position - place < speed**2 / 10 + 0.1 * speed + 0.01
 
 
+def test_what_commands_have_set_ends_with_their_client() -> None:
+    plant = Mass()
+    rig = rig_of(plant)
+    mode = POSITION | GAINS | MAX_FORCE | ControlMode.SPECIFIED_MAX_VEL_ACC
+    rig.write(mode=mode, position=0.5, k=0.0, max_force=3.0, max_velocity=0.01, max_acceleration=0.1)
+    rig.tick(200)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.bank.forget_settings(rig.axes)
+    rig.tick(200)
+    assert rig.field("k") == 400.0
+    rig.write(mode=POSITION, position=0.5)
+    rig.run()
+    rig.tick(500)
+    assert abs(plant.position - 0.5) < 1e-2
+    assert rig.trace("commanded_velocity").max() > 1.0
+
+
+def test_limits_that_are_set_of_a_stopped_axis_leave_what_holds_it() -> None:
+    plant = Mass(viscous=0.0, pull=-2.0)
+    rig = rig_of(plant)
+    rig.tick(500)
+    rig.write(mode=POSITION | GAINS, position=0.0, k=0.0)
+    rig.tick(50)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(1500)
+    place = plant.position
+    rig.bank.set_limits(rig.axes, force_max=5.0)
+    rig.tick(1000)
+    assert abs(plant.position - place) < 1e-4
+
+
 @settings(max_examples=25, deadline=None, phases=(Phase.explicit, Phase.reuse, Phase.generate))
 @given(
     k=st.floats(-500, 5000), kb=st.floats(-100, 50), kz=st.floats(-2, 1), kp=st.floats(-0.99, 0.99),
