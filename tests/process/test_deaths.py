@@ -323,3 +323,42 @@ def test_a_client_that_is_stopped_loses_its_axes_without_a_lease(
             with cell.open("mod0.xaxis", "rw", timeout=1.0):
                 pass
         victim.wait_line("its client was stopped, as by Ctrl-Z")
+
+
+FREEZERS = (
+    ("/sys/fs/cgroup", "cgroup.freeze", "1", "0"), ("/sys/fs/cgroup/unified", "cgroup.freeze", "1", "0"),
+    ("/sys/fs/cgroup/freezer", "freezer.state", "FROZEN", "THAWED"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("root", "file", "freeze", "thaw"), FREEZERS)
+def test_a_client_that_is_frozen_loses_its_axes_without_a_lease(
+    daemon: Daemon, cell: sioms.Workcell, client: Callable[..., Client], root: str, file: str, freeze: str, thaw: str
+) -> None:
+    """As by ``systemctl freeze`` or ``docker pause``: the process sleeps, as far as its state tells."""
+    outer = Path(root, f"sioms-test-{os.getpid()}")
+    group = outer / "inner"
+    try:
+        group.mkdir(parents=True)
+    except OSError as error:
+        pytest.skip(f"no control group can be made: {error}")
+    try:
+        if not (outer / file).exists():
+            pytest.skip("no freezer there")
+        victim = client(daemon, jog("mod0.xaxis", 0.02) + "while True:\n    time.sleep(0.05)\n    node.limits()\n")
+        with cell.open("mod0.readonly") as seen:
+            wait_for(lambda: seen.read().in_motion[0], "moving")
+            (group / "cgroup.procs").write_text(str(victim.pid))
+            time.sleep(0.3)
+            assert seen.read().in_motion[0], "it is in a group that is not frozen"
+            (outer / file).write_text(freeze)
+            try:
+                assert at_rest(seen, 2.0) < 1.0
+            finally:
+                (outer / file).write_text(thaw)
+        victim.wait_line("or frozen")
+        victim.kill()
+        wait_for(lambda: not (group / "cgroup.procs").read_text(), "gone")
+    finally:
+        group.rmdir()
+        outer.rmdir()
