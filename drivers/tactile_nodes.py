@@ -148,9 +148,12 @@ class TactileNodes:
         # a device's clock that began anew may lie a little before the frames already sensed
         self._stamp_ns = max(self._stamp_ns, stamp_ns)
         strain, load = self._sensor.strain(readings, self._stamp_ns, self._load(stamp_ns, now_ns))
-        lost = int(np.bitwise_or.reduce(flags)) & int(AnalogStatus.OVERRUN)
+        told = int(np.bitwise_or.reduce(flags)) & int(AnalogStatus.OVERRUN | AnalogStatus.SATURATED)
+        lost, saturated = told & int(AnalogStatus.OVERRUN), told & int(AnalogStatus.SATURATED)
         self.strain.data[:] = strain.strains
-        self.strain.flags[:] = lost | np.where(strain.saturated, int(AnalogStatus.SATURATED), 0)
+        self.strain.flags[:] = lost | np.where(
+            strain.saturated, int(AnalogStatus.SATURATED), flags & int(AnalogStatus.SATURATED)
+        )
         self._left_out |= lost
         new = self.blocks
         if begun_ns is not None and self._kit.now_ns() - begun_ns > BEHIND_NS:
@@ -158,7 +161,7 @@ class TactileNodes:
             new = new[:1]
         else:
             self.shape.data[:] = self._numbers(self._sensor.estimate(strain, load))
-            self.shape.flags[:], self._left_out = self._left_out, 0
+            self.shape.flags[:], self._left_out = self._left_out | saturated, 0
         for block in new:
             block.flags[np.isnan(block.data)] |= int(AnalogStatus.INVALID)
             block.stamp_ns = stamp_ns
@@ -183,7 +186,7 @@ class TactileNodes:
                     return self._set_gains(argument)
         except OSError as error:
             raise Refusal(errno.EIO, f"finger_file {self._settings.finger_file}: {error.strerror}") from None
-        except ValueError as error:
+        except (ValueError, TypeError, ArithmeticError) as error:  # of what a client has sent
             raise Refusal(errno.EINVAL, str(error)) from None
         raise Refusal(errno.ENOTTY, f"{request.name} is not a request {block.name} knows")
 

@@ -34,7 +34,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sioms.tactile.finger import Finger
+from sioms.tactile.finger import LARGEST, LEAST, Finger
 from sioms.tactile.linearity import linearise
 from sioms.tactile.model import StrainTable
 from sioms.tactile.rest import Rebase, Rest
@@ -196,10 +196,10 @@ class SignalChain:
         if new.shape not in ((self._count,), (self._count, self._count)):
             raise ValueError(f"set gain: {new.size} gains in shape {new.shape}; the finger has {self._count} elements")
         own = new if new.ndim == 1 else np.diag(new)
-        if not (np.all(np.isfinite(new)) and np.all(own > 0.0)):
+        if not (np.all(np.abs(new) <= LARGEST) and np.all(own >= LEAST)):
             raise ValueError(
                 f"set gain: gains of the elements {own.tolist()} hold one that is not positive, or the matrix one "
-                "that is not finite"
+                f"that is not finite; want {LEAST:g} to {LARGEST:g}"
             )
         self._gain = own.copy()
         self._mixing = new if new.ndim == 2 and np.count_nonzero(new - np.diag(own)) else None

@@ -12,6 +12,8 @@ business.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from itertools import pairwise
 from typing import Any, Literal
 
 import msgspec
@@ -31,6 +33,16 @@ FORMAT = "sioms finger 1"
 MOST_ADHESION = 1.5  # full adhesion has no size of its own below Poisson's ratio 1/2: see `contact.adhere`
 ContactKind = Literal["frictionless", "adhering", "hertz"]
 PressureKind = Literal["exact", "elliptic"]
+
+
+LEAST, LARGEST = 1e-12, 1e12
+"""Size of any number of a finger that is not 0 or may not be."""
+POSITIVE = frozenset(
+    {
+        "core_m", "outer_m", "shear_modulus_pa", "noise", "ratio", "drift_time_s", "proximity_range_rad",
+        "most_load_n_per_m",
+    }
+)  # fmt: skip
 
 
 class Geometry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -146,6 +158,7 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         what = f"load finger {self.name!r}"
         if self.format != FORMAT:
             raise ValueError(f"{what}: format is {self.format!r}; need {FORMAT!r}")
+        self._check_sizes(what)
         self.cylinder  # noqa: B018 - refuses a bad geometry
         self._check_elements(what)
         if self.identified is not None:
@@ -164,6 +177,31 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         if not self.signal.lowest < self.signal.highest:
             raise ValueError(f"{what}: lowest reading {self.signal.lowest} is not below {self.signal.highest}")
 
+    def _check_sizes(self, what: str) -> None:
+        """Refuse numbers of no finger: what is squared and divided from them overflows, or is not a number."""
+        for part in (self.geometry, self.elements, self.signal, self.contact, self.identified):
+            for name in () if part is None else part.__struct_fields__:
+                value = getattr(part, name)
+                for number in _numbers(value) if name not in ("lowest", "highest") else ():
+                    if not abs(number) <= LARGEST:
+                        raise ValueError(
+                            f"{what}: {name} holds {number}; need finite numbers, at most {LARGEST:g}; used = false "
+                            "leaves an element out"
+                        )
+                    if name in POSITIVE and not number >= LEAST:
+                        raise ValueError(f"{what}: {name} holds {number}; need > 0, at least {LEAST:g}")
+        for name, number in (
+            ("misfit", min(self.elements.misfit, default=0.0)), ("circles", self.contact.circles),
+            ("release_hold_s", self.signal.release_hold_s),
+        ):  # fmt: skip
+            if number < 0.0:
+                raise ValueError(f"{what}: {name} is {number}; need 0 or more")
+        if not abs(self.signal.scale) >= LEAST:
+            raise ValueError(f"{what}: scale is {self.signal.scale}; need the output per raw unit")
+        widths = self.contact.half_width_rad
+        if widths and (widths[0] != 0.0 or any(not a < b for a, b in pairwise(widths))):
+            raise ValueError(f"{what}: half_width_rad is {widths[:3]} ...; need widths that rise from 0")
+
     def _check_elements(self, what: str) -> None:
         count, geometry = len(self.elements.angle_rad), self.geometry
         if count < 4:
@@ -172,18 +210,16 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
             column = getattr(self.elements, name)
             if len(column) != count:
                 raise ValueError(f"{what}: {len(column)} values of {name} for {count} elements")
-            if name != "used" and not all(math.isfinite(x) for x in column):
-                raise ValueError(f"{what}: {name} holds a value that is not finite; set used = false to leave it out")
         for place, (radius, gain) in enumerate(zip(self.elements.radius_m, self.elements.gain, strict=True)):
             if not geometry.core_m < radius <= geometry.outer_m:
                 raise ValueError(
                     f"{what}: element {place} has radius {radius} m; need {geometry.core_m} < radius <= "
                     f"{geometry.outer_m}"
                 )
-            if not gain > 0.0:
+            if not gain >= LEAST:
                 raise ValueError(f"{what}: element {place} has gain {gain}; need > 0")
-        if min(self.elements.noise) <= 0.0:
-            raise ValueError(f"{what}: noise {min(self.elements.noise)}; need > 0 (at least a digit's share)")
+        if len({round(angle, 6) for angle in self.elements.angle_rad}) < count:
+            raise ValueError(f"{what}: two elements have one angle_rad; need places that differ")
 
     def _check_map(self, what: str, found: IdentifiedMap) -> None:
         widths = {len(row) for row in found.rows}
@@ -330,3 +366,12 @@ def _toml(value: Any) -> str:
         case list() | tuple():
             return "[" + ", ".join(_toml(item) for item in value) + "]"
     raise TypeError(f"write finger: no TOML for {type(value).__name__}")
+
+
+def _numbers(value: Any) -> Iterator[float]:
+    """Return the numbers in a value and the tuples in it."""
+    if isinstance(value, tuple):
+        for inner in value:
+            yield from _numbers(inner)
+    elif isinstance(value, float):
+        yield value

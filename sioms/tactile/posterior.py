@@ -81,14 +81,15 @@ class Averager:
         with np.errstate(divide="ignore", invalid="ignore"):
             radius = self.widths.product(square)[:, None] / np.maximum(p, 0.0)
         chi = np.sum(y * y * weights, axis=1) - fy * p
-        possible = (p > 0.0) & (radius <= self.largest)
+        flat, likely = self.widths.cylinder.outer_m, np.ones_like(radius)
+        if self.largest > flat:
+            likely = np.clip(_FALL * (self.largest - radius) / (self.largest - flat), 0.0, 1.0)
+        possible = (p > 0.0) & (radius <= self.largest) & (likely > 0.0)
         if not possible.any():
             return None
         # P integrates out to 1/sqrt(ff); rows are even steps of the half width
         share = np.exp(-0.5 * np.where(possible, chi - chi[possible].min(), np.inf)) / np.sqrt(ff)
-        flat = self.widths.cylinder.outer_m
-        if self.largest > flat:
-            share *= np.clip(_FALL * (self.largest - radius) / (self.largest - flat), 0.0, 1.0)
+        share[possible] *= likely[possible]
         share /= share.sum()
         values = np.stack([np.broadcast_to(t, p.shape)[possible], p[possible], radius[possible]])
         share_of, spread = share[possible], 1.0 / ff[possible]

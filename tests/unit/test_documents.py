@@ -18,6 +18,7 @@ from sioms.tactile.finger import from_toml
 
 BAD: list[tuple[Callable[[Any], Any], bytes, str]] = [
     (toml_of, b"x = " + b"[" * 2000 + b"]" * 2000, "nested too deep"),
+    (toml_of, b"a. " * 200_000 + b"b = 1", "nested too deep"),
     (toml_of, b"x = " + b"[" * 50 + b"]" * 50, f"nested deeper than {DEEPEST}"),
     (toml_of, b"x = " + b"9" * 5000, "digits"),
     (toml_of, b"x = 99999999999999999999", "x: an integer of more than 64 bits"),

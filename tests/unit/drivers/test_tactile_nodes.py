@@ -83,6 +83,18 @@ def test_shape_is_published_beside_raw_and_strain(bench, hand):
     np.testing.assert_allclose(strain.data, -0.03 * raw.data, atol=1.5e-3)
 
 
+def test_what_the_device_calls_saturated_is_so_in_strain_and_shape(bench, hand):
+    """A front end says so of a whole frame: no element can be left out, and nothing be called good."""
+    finger = bench.make(SimTactile, "tactile0", table())
+    bench.run(0.2)
+    nodes, raw = finger._finger, finger.blocks[0].data.copy()
+    nodes.take(raw, np.full(16, int(AnalogStatus.SATURATED)), 10**12, 10**12)
+    assert set(nodes.strain.flags) == {int(AnalogStatus.SATURATED)}
+    assert all(flags & int(AnalogStatus.SATURATED) for flags in nodes.shape.flags)
+    nodes.take(raw, np.zeros(16, dtype=np.int64), 10**12 + 10**6, 10**12)
+    assert not any(flags & int(AnalogStatus.SATURATED) for flags in nodes.shape.flags)
+
+
 def test_what_only_the_tables_needed_is_given_back(bench, hand):
     body = cylinder.Cylinder(9.6e-3, 12.7e-3, 0.499)
     cylinder.respond(body, np.arange(4.0), 0.01)  # tables of the file's own body may be there already
@@ -230,6 +242,8 @@ def test_zeros_at_the_same_time_are_one_and_end_with_the_finger(bench, hand):
     [
         (1, Request.SET_GAINS, [1.0], "1 gains; want 16, or 16 rows of 16"),
         (1, Request.SET_GAINS, [-1.0] * 16, "not positive"),
+        (1, Request.SET_GAINS, [1e300] * 16, "want 1e-12 to 1e\\+12"),
+        (1, Request.SET_GAINS, {"a": 1}, "not 'dict'"),
         (2, Request.SET_GAINS, [1.0] * 16, "not a request shape knows"),
         (2, Request.CALIBRATE_DEVICE, "x = 1", "unknown field `x`"),
         (2, Request.CALIBRATE_DEVICE, [1.0], "want the text of a finger's file"),

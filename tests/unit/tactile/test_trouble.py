@@ -271,3 +271,25 @@ def test_a_converter_that_sticks_is_told_from_a_quiet_one() -> None:
         finger.go(0.1, held)
         assert finger.states[-1] is (State.TOUCHED if held.any() else State.UNTOUCHED)
         assert np.array_equal(before, finger.offset)
+
+
+@cases(("noise", 3.0), ("noise", 30.0), ("hum", 0.1))
+def test_loud_readings_are_doubted_and_end_nothing(case: tuple[str, float]) -> None:
+    """A wire that has come off, a pump beside the finger: once in hundreds of frames no touch was likely at all, and
+    the mean over none ended the driver.
+    """
+    what, size = case
+    finger = Finger(seed=4)
+    seen: list[State] = []
+    phases = np.random.default_rng(1).uniform(0.0, 2 * math.pi, 16)
+    for number in range(RATE):
+        if what == "noise":
+            finger.noise = 0.023 * size
+            finger.go(1 / RATE)
+        else:
+            finger.go(1 / RATE, size * np.sin(2 * math.pi * 50 * number / RATE + phases))
+        seen += finger.states
+    assert seen.count(State.TOUCHED) < 0.2 * len(seen) and State.DOUBTFUL in seen
+    finger.noise = 0.023
+    finger.go(2.5)
+    finger.works()
