@@ -232,28 +232,26 @@ def test_one_edge_does_not_tell_a_shift_from_a_scale() -> None:
     assert judge(was, seen, 0.4).names != ("place",)
 
 
-def test_an_edge_counts_where_the_speed_is_steady() -> None:
-    """While an axis brakes, the other flank of a play may bear."""
+def crossings_of(speed_mps: float, rate: float, edges: list[float]) -> list[Crossing]:
+    """Return what a watch keeps of edges [s] in a move of 1.2 s that speeds up and brakes within ``1 / rate``."""
     watch, n = AxisWatch(ABOUT, Settings()), 1200
     t = TICK_S * np.arange(n)
-    speed = 0.2 * np.clip(4.0 * np.minimum(t, t[-1] - t), 0.0, 1.0)
+    speed = speed_mps * np.clip(rate * np.minimum(t, t[-1] - t), 0.0, 1.0)
     x = np.cumsum(speed) * TICK_S
     move = replace(samples(x, np.ones(n)), speed=speed)
-    watch.feed(move.and_then(samples(np.full(200, x[-1]), np.zeros(200), 1.2, slice(0, 0))), [0.1, 0.6, 1.1])
-    (crossing,) = watch._collector.crossings
-    assert crossing.place == pytest.approx(float(np.interp(0.6, t, x)), abs=1e-6) and crossing.way == 1
+    watch.feed(move.and_then(samples(np.full(200, x[-1]), np.zeros(200), 1.2, slice(0, 0))), edges)
+    return watch._collector.crossings
+
+
+def test_an_edge_counts_where_the_speed_is_steady() -> None:
+    """While an axis brakes, the other flank of a play may bear."""
+    (crossing,) = crossings_of(0.2, 4.0, [0.1, 0.6, 1.1])
+    assert crossing.place == pytest.approx(0.2 * (0.6 - 0.125), abs=2e-4) and crossing.way == 1
 
 
 def test_an_edge_counts_where_inertia_says_which_flank_bears() -> None:
     """Speeding up and braking, the load is pushed to and fro; in between a change of speed nothing is said."""
-    watch, n = AxisWatch(ABOUT, Settings()), 1200
-    t = TICK_S * np.arange(n)
-    speed = 0.3 * np.clip(10.0 * np.minimum(t, t[-1] - t), 0.0, 1.0)
-    x = np.cumsum(speed) * TICK_S
-    move = replace(samples(x, np.ones(n)), speed=speed)
-    edges = [0.02, 0.08, 0.11, 0.6, 1.18]
-    watch.feed(move.and_then(samples(np.full(200, x[-1]), np.zeros(200), 1.2, slice(0, 0))), edges)
-    assert [c.way for c in watch._collector.crossings] == [2, 1, -2]
+    assert [c.way for c in crossings_of(0.3, 10.0, [0.02, 0.08, 0.11, 0.6, 1.18])] == [2, 1, -2]
 
 
 def test_a_place_is_told_from_a_play_by_the_edges_under_acceleration() -> None:
