@@ -254,7 +254,7 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
         excited = gate(ready.problem, ready.model, ready.names)
         names = tuple(n for n in ready.names if n not in excited.missing)
         searcher = Searcher(ready.problem, tuple(f.effect for f in ready.findings), names, progress=o.progress)
-        found = searcher.run(start)
+        found, excited = _larger(searcher, searcher.run(start), excited)
         if earlier:
             found = replace(
                 found,
@@ -274,6 +274,25 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
         final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
         ready = replace(ready, problem=anew, final=final)
     return ready, excited, searcher, found
+
+
+def _larger(searcher: Searcher, found: Found, excited: Gate) -> tuple[Found, Gate]:
+    """Search on, above the floor, among effects that would not show at their typical size: they may be larger.
+
+    They come after all others, so that what is typical has precedence, and count by the same evidence.
+    """
+    if searcher.done(found.fit) or not excited.faint:
+        return found, excited
+    searcher.progress("what would only show if it were larger than usual")
+    names = searcher.names
+    searcher.names = names + excited.faint
+    further = searcher.run(found.fit.model)
+    new = [n for n in excited.faint if n in further.fit.model.effects]
+    if not new:
+        searcher.names = names
+        return found, excited
+    missing = {n: why for n, why in excited.missing.items() if n not in new}
+    return replace(further, ladder=(*found.ladder, *further.ladder[1:])), replace(excited, missing=missing)
 
 
 def _beside(ready: Prepared, searcher: Searcher, found: Found) -> Timed | None:

@@ -22,7 +22,7 @@ from sioms.reconcile.screen import (
     state_columns,
     trial_values,
 )
-from sioms.reconcile.thresholds import AXIS, SAME
+from sioms.reconcile.thresholds import AXIS, LARGEST, SAME
 from sioms.reconcile.variation import accompanied
 
 
@@ -34,11 +34,13 @@ class Gate:
         traces: root mean square trace of each effect at its typical size, in units of the floor.
         pairs: effects that these records cannot tell apart, with the share of energy they have in common.
         missing: effects not excited, with the record that would excite them.
+        faint: of these the ones that would show if they were as large as they can be.
     """
 
     traces: dict[str, float]
     pairs: tuple[tuple[str, str, float], ...]
     missing: dict[str, str]
+    faint: tuple[str, ...]
 
 
 def gate(problem: Problem, model: AxisModel, names: tuple[str, ...]) -> Gate:
@@ -47,6 +49,7 @@ def gate(problem: Problem, model: AxisModel, names: tuple[str, ...]) -> Gate:
     columns = {n: c for n in names if (c := _trace(problem, model, lib[n])) is not None}
     traces = {n: float(np.sqrt(np.mean(np.sum(c, axis=1) ** 2))) for n, c in columns.items()}
     missing = {n: lib[n].separate for n, t in traces.items() if t < AXIS.trace}
+    faint = tuple(n for n in missing if traces[n] * _largest(lib[n]) >= AXIS.trace)
     pairs = []
     shown = [n for n in columns if n not in missing]
     for i, a in enumerate(shown):
@@ -55,7 +58,15 @@ def gate(problem: Problem, model: AxisModel, names: tuple[str, ...]) -> Gate:
             contained = b in lib[a].replaces or a in lib[b].replaces
             if alike and not contained and (same := common(columns[a], columns[b])) > SAME:
                 pairs.append((a, b, same))
-    return Gate(traces, tuple(sorted(pairs, key=lambda p: -p[2])), missing)
+    return Gate(traces, tuple(sorted(pairs, key=lambda p: -p[2])), missing, faint)
+
+
+def _largest(effect: Effect) -> float:
+    """How many times its typical size an effect may have."""
+    p = effect.primary
+    typical = abs(p.start - effect.neutral)
+    most = max(p.upper - effect.neutral, effect.neutral - p.lower)
+    return float(min(most / typical, LARGEST)) if typical > 0.0 else 1.0
 
 
 def common(a: Array, b: Array) -> float:

@@ -105,6 +105,11 @@ everything; fingers and force sensors of a fresh origin (0074).
 PAIRS = 3
 """Firsts of two effects at once, each with the best few seconds."""
 
+LARGEST = 30.0
+"""Natural sizes that an effect may have to be searched for: a large drift in a short record, on sensors (0074). On
+axes above the floor, after all that shows at its natural size: an eccentricity of ten times it, which left 0.05 of the
+floor at one (1010)."""
+
 # --- when a look-alike is ruled out
 
 AMBIGUOUS = 0.015
@@ -227,7 +232,5 @@ MOST_INSIDE = 0.7
 """Share of the elements whose own number must be one that the effect can have (0072)."""
 SHARPER = 0.6
 """Share of a stated floor below which the one told beside a model counts (0074)."""
-LARGEST = 30.0
-"""Natural sizes that an effect may have to be searched for: a large drift in a short record (0074)."""
 FELT = 3.0
 """Standard deviations that an element's own number must make for its look-alikes to be told by it."""

@@ -17,9 +17,12 @@ from sioms.reconcile import command as reconcile
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.command.blind import solve
 from sioms.reconcile.command.selftest import generate, record, write_public
+from sioms.reconcile.excitation import gate
 from sioms.reconcile.files.axis import read_data, read_model
-from sioms.reconcile.prepare import Options
+from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Session
+from sioms.reconcile.verdict import Outcome
+from sioms.reconcile_selftest.axis import Axis, Servo
 from sioms.reconcile_selftest.draw import draw_axis
 from sioms.reconcile_selftest.score import score
 
@@ -73,6 +76,25 @@ def test_one_cruising_speed_leaves_coulomb_and_viscous_friction_open(tmp_path: P
     assert other["viscous"]["b_extra"] == pytest.approx(0.24027 / 9.78, rel=0.05)  # the level over the one speed
     assert found["separation_in_noise"] > 10.0  # type: ignore[operator]
     assert (tmp_path / "experiment.csv").exists()
+
+
+def test_an_effect_that_would_not_show_at_its_typical_size_is_found_where_it_is_larger(tmp_path: Path) -> None:
+    """A slow axis with a coarse encoder: an eccentricity of a thousandth of a turn shows nothing there."""
+    hidden = {"eccentricity": {"amp": 0.0623, "phase": -0.11}}
+    axis = Axis(
+        "slow", "single", True, 0.001, 7.35e-4, 1.57e-4, 0.306, 8.0, 2.0 * np.pi / 2048, 2.0 * np.pi,
+        Servo(0.349, 0.0, 0.0, -0.0267, 0.765, 60.5), "full", False, True, 17, hidden,
+    )  # fmt: skip
+    write_public(axis, record(axis, 3.0), tmp_path / "slow")
+    model = read_model(tmp_path / "slow" / "nominal.toml")
+    session = read_data(tmp_path / "slow", model)
+    ready = prepare(session, model, Options())
+    assert "eccentricity" in gate(ready.problem, ready.model, ready.names).missing
+    verdict = analyse(session, model, Options(pictures=False))
+    assert verdict.outcome is Outcome.NAMED
+    assert [e.name for e in verdict.effects] == ["eccentricity"]
+    assert verdict.model.effects["eccentricity"]["amp"] == pytest.approx(0.0623, rel=0.03)
+    assert "eccentricity" not in verdict.missing
 
 
 @pytest.mark.timeout(400)
