@@ -45,19 +45,46 @@ def usable(session: Session, seen: Session, model: AxisModel) -> tuple[Session, 
     """
     for r in session.final:
         check_one(r, r, model)
-    kept, refused = [], []
+    checked, refused = [], []
     for r, part in zip(session.records, seen.records, strict=True):
         try:
             check_one(r, part, model)
-            kept.append(r)
+            checked.append((r, part))
         except BadInputError as e:
             refused.append(e)
+    odd = _of_another_loop([part for _, part in checked], model)
+    kept = [r for (r, _), error in zip(checked, odd, strict=True) if error is None]
+    refused += [error for error in odd if error is not None]
     if not refused:
         return session, []
     if sum(map(len, kept)) < ENOUGH * session.samples:
         raise refused[0]
     notes = [f"left out, the others are used: {e}" for e in refused]
     return replace(session, records=tuple(kept), continuous=False), notes
+
+
+def _of_another_loop(records: list[Record], model: AxisModel) -> list[BadInputError | None]:
+    """Say of records why the controller does not make their forces, where it makes those of others: it is one loop.
+
+    A limit below the stated one is the axis's own.
+    """
+    if model.controller is None:
+        return [None] * len(records)
+    offs = []
+    for r in records:
+        limit = min(model.controller.limit, float(np.max(np.abs(r.force), initial=0.0)))
+        offs.append(beyond_feedback(r, replace(model, controller=replace(model.controller, limit=limit))))
+    holds = [r.name for r, off in zip(records, offs, strict=True) if r.command is not None and off <= 0.1 * FOREIGN]
+    return [
+        BadInputError(
+            f"read record {r.name}: the controller of the model does not make its force from command and position (off "
+            f"by {100 * off:.0f} % of the force), as it does in {holds[0]}; is it of another run, in another order, or "
+            "with something added to the force? what was added is its feedforward"
+        )
+        if holds and off > FOREIGN
+        else None
+        for r, off in zip(records, offs, strict=True)
+    ]
 
 
 def check_one(record: Record, r: Record, model: AxisModel) -> None:
@@ -199,6 +226,7 @@ def _otherwise(r: Record, command: Array) -> Iterable[tuple[str, Record]]:
     if r.force_measured is not None:
         yield "force and force_measured are exchanged", replace(r, force=r.force_measured)
     yield "the command is turned round", replace(r, command=-command)
+    yield "the rows are taken in reverse order", r.only(slice(None, None, -1))
     for n in SHIFTS:
         for k in (n, -n):
             part = slice(max(k, 0), len(r) + min(k, 0))

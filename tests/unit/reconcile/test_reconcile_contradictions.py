@@ -90,6 +90,7 @@ def test_records_that_agree_with_themselves_pass() -> None:
         (lambda r: replace(r, command=exchanged(np.asarray(r.command), 0)), "the command is smoother with"),
         (rows(lambda n: exchanged(np.arange(n), 1)), "exchanged; the rows are in no order of time"),
         (lambda r: replace(r, command=-r.command), "turned round"),
+        (rows(lambda n: np.arange(n)[::-1]), "reverse order"),
         (lambda r: replace(r, position=r.position % (0.3 * np.ptp(r.position))), "leaps"),
     ],
 )
@@ -174,6 +175,22 @@ def test_one_bad_record_is_left_out_and_two_of_three_are_too_many() -> None:
         both(replace(session, records=(good, doubled(good), doubled(good))), model)
     with pytest.raises(BadInputError, match="come twice"):  # a final record was chosen to be one
         both(replace(session, final=(bad,)), model)
+
+
+def test_one_record_of_which_another_loop_makes_the_force_is_left_out() -> None:
+    """A third of the force is too little to say that the controller is another axis's; it is none of this one's."""
+    session, model = given()
+    one, two, *rest = session.records
+    two = replace(two, force_measured=None)
+    foreign = replace(two, force=np.where(np.arange(len(two)) < len(two) // 2, two.force, 0.7 * two.force))
+    assert 0.05 < beyond_feedback(foreign, model) < 0.5
+    kept, (note,) = both(replace(session, records=(one, foreign, *rest)), model)
+    assert foreign.name not in [r.name for r in kept.records]
+    assert foreign.name in note and "as it does in" in note
+    peak = 0.5 * float(np.max(np.abs(two.force)))
+    limited = replace(two, force=np.clip(two.force, -peak, peak))
+    assert beyond_feedback(limited, model) > 0.05
+    assert not both(replace(session, records=(one, limited, *rest)), model)[1], "a lower limit is an effect"
 
 
 def test_a_force_that_takes_two_levels_is_no_saturation() -> None:
