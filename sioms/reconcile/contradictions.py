@@ -26,6 +26,8 @@ SHIFTS = (*range(2, 31), 40, 50, 60, 80, 100)
 BETTER = 0.2
 #: Rows at least in which a position is new, for their distances to tell anything.
 LEAST_NEW = 20
+#: How a note begins of a record that is left out.
+LEFT_OUT = "left out, the others are used"
 #: Of the samples so many are in records that can be used; else none is.
 ENOUGH = 0.5
 
@@ -59,7 +61,7 @@ def usable(session: Session, seen: Session, model: AxisModel) -> tuple[Session, 
         return session, []
     if sum(map(len, kept)) < ENOUGH * session.samples:
         raise refused[0]
-    notes = [f"left out, the others are used: {e}" for e in refused]
+    notes = [f"{LEFT_OUT}: {e}" for e in refused]
     return replace(session, records=tuple(kept), continuous=False), notes
 
 

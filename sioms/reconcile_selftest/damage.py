@@ -19,13 +19,14 @@ Run = dict[str, NDArray[Any]]
 @dataclass(frozen=True, slots=True)
 class Public:
     """What a solver may see: recordings by columns, the names of the columns that are described, the tables of the
-    model, and files that are written as they are.
+    model, and files that are written as they are. It does not see what the axis hides.
     """
 
     runs: tuple[Run, ...]
     described: tuple[str, ...]
     model: dict[str, dict[str, Any]]
     raw: Mapping[str, bytes] | None = None
+    hidden: tuple[str, ...] = ()
 
     def each(self, change: Callable[[Run], Run]) -> Public:
         """Change every recording."""

@@ -1,7 +1,7 @@
 """``sioms reconcile selftest --damaged``: damage what generated axes recorded, and see that nothing is named.
 
 An answer is an *error* that says what is wrong, or a *refusal* (unexplained). A name, "nothing is missing", and a
-traceback are faults.
+traceback are faults; unless what is damaged was left out with its reason, and the rest tells what it hides.
 """
 
 from __future__ import annotations
@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile.command.selftest import record
+from sioms.reconcile.contradictions import LEFT_OUT
 from sioms.reconcile_selftest.axis import Axis
 from sioms.reconcile_selftest.damage import Public
 from sioms.reconcile_selftest.damage_within import EVERY
@@ -45,6 +46,7 @@ class Answer:
     Attributes:
         outcome: "error", "traceback", or the verdict.
         names: that it gave, also beside a refusal.
+        left_out: whether records were, and the names are all that the others hide.
     """
 
     kind: str
@@ -52,11 +54,12 @@ class Answer:
     names: tuple[str, ...]
     text: str
     seconds: float
+    left_out: bool = False
 
     @property
     def right(self) -> bool:
-        """Whether nothing was named."""
-        return self.outcome == ERROR or (self.outcome == "unexplained" and not self.names)
+        """Whether nothing was named that is not there."""
+        return self.outcome == ERROR or (self.outcome == "unexplained" and not self.names) or self.left_out
 
 
 def damaged(
@@ -86,7 +89,7 @@ def damaged(
             one, other = pairs[i % len(pairs)]
             folder = Path(base) / f"kind{i:03d}"
             write(damage(one, other, rng), folder)
-            answers.append(_answer(kind, folder, solve))
+            answers.append(_answer(kind, folder, solve, one.hidden))
             shutil.rmtree(folder)
             a = answers[-1]
             said = f"{a.outcome}{': ' + ', '.join(a.names) if a.names else ''}"
@@ -118,7 +121,7 @@ def _seen(axis: Axis) -> Public:
         }
         for r in record(axis)
     )
-    return Public(runs, tuple(COLUMNS), axis.public())
+    return Public(runs, tuple(COLUMNS), axis.public(), hidden=(*axis.named, *axis.nameless))
 
 
 def write(public: Public, folder: Path) -> None:
@@ -141,7 +144,9 @@ def _toml(value: Any) -> str:
     return "nan" if isinstance(value, float) and np.isnan(value) else json.dumps(value)
 
 
-def _answer(kind: str, folder: Path, solve: Callable[[list[str]], int]) -> Answer:
+def _answer(
+    kind: str, folder: Path, solve: Callable[[list[str]], int], hidden: tuple[str, ...] = ()
+) -> Answer:
     out, said = folder / "report", io.StringIO()
     arguments = ["axis", str(folder), "--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet"]
     began = time.monotonic()
@@ -158,7 +163,9 @@ def _answer(kind: str, folder: Path, solve: Callable[[list[str]], int]) -> Answe
         return Answer(kind, ERROR if told else TRACEBACK, (), text.removeprefix("bad input: "), seconds)
     found: Mapping[str, Any] = json.loads((out / "verdict.json").read_text())
     names = tuple(dict.fromkeys([*found["effects"], *(n for a in found["alternatives"] for n in a)]))
-    return Answer(kind, str(found["verdict"]), names, (found["notes"] or [""])[-1], seconds)
+    notes, outcome = found["notes"], str(found["verdict"])
+    whole = outcome in ("named", "none") and set(names) == set(hidden)
+    return Answer(kind, outcome, names, (notes or [""])[-1], seconds, whole and any(LEFT_OUT in n for n in notes))
 
 
 def table(answers: Sequence[Answer]) -> str:
@@ -169,8 +176,9 @@ def table(answers: Sequence[Answer]) -> str:
         ("error with its reason", sum(a.outcome == ERROR for a in answers)),
         ("refused, nothing named", sum(not a.names for a in refused)),
         ("refused beside a name for a part", sum(bool(a.names) for a in refused)),
-        ("a name", sum(a.outcome in ("named", "ambiguous") for a in answers)),
-        ("nothing is missing", sum(a.outcome == "none" for a in answers)),
+        ("the damaged record left out, the rest right", sum(a.left_out for a in answers)),
+        ("a name", sum(a.outcome in ("named", "ambiguous") and not a.left_out for a in answers)),
+        ("nothing is missing", sum(a.outcome == "none" and not a.left_out for a in answers)),
         ("traceback", sum(a.outcome == TRACEBACK for a in answers)),
     ]
     return "\n".join(f"{a:50s} {b}" for a, b in lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -13,7 +14,7 @@ import pytest
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.command import main
 from sioms.reconcile.command.damaged import COLUMNS, damaged, write
-from sioms.reconcile.contradictions import check_law, usable
+from sioms.reconcile.contradictions import LEFT_OUT, check_law, usable
 from sioms.reconcile.controlled import beyond_feedback
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.axis import read_data, read_model
@@ -249,3 +250,26 @@ def test_damage_to_files_and_models_is_told(capsys: pytest.CaptureFixture[str]) 
     assert damaged(3, main, kinds, pool=[(public(), public())]) == 0
     shown = capsys.readouterr().out
     assert shown.count("right  ") == len(kinds) and "traceback" in shown
+
+
+def test_a_damaged_record_that_is_left_out_is_right_where_the_rest_tells_what_it_hides(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    def answers(verdict: str, names: list[str], note: str) -> Callable[[list[str]], int]:
+        def solve(arguments: list[str]) -> int:
+            out = Path(arguments[arguments.index("--out") + 1])
+            out.mkdir()
+            found = {"verdict": verdict, "effects": names, "alternatives": [], "notes": [note]}
+            (out / "verdict.json").write_text(json.dumps(found))
+            return 0
+
+        return solve
+
+    pool = [(replace(public(), hidden=("backlash",)), public())]
+    told = f"{LEFT_OUT}: read record run0: the rows are taken in reverse order"
+    for verdict, names, note, status in (
+        ("named", ["backlash"], told, 0), ("named", ["coulomb"], told, 1), ("none", [], told, 1),
+        ("named", ["backlash"], "", 1),
+    ):  # fmt: skip
+        assert damaged(3, answers(verdict, names, note), ("one record backwards",), pool=pool) == status
+    capsys.readouterr()
