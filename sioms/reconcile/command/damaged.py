@@ -144,9 +144,7 @@ def _toml(value: Any) -> str:
     return "nan" if isinstance(value, float) and np.isnan(value) else json.dumps(value)
 
 
-def _answer(
-    kind: str, folder: Path, solve: Callable[[list[str]], int], hidden: tuple[str, ...] = ()
-) -> Answer:
+def _answer(kind: str, folder: Path, solve: Callable[[list[str]], int], hidden: tuple[str, ...] = ()) -> Answer:
     out, said = folder / "report", io.StringIO()
     arguments = ["axis", str(folder), "--model", str(folder / "nominal.toml"), "--out", str(out), "--quiet"]
     began = time.monotonic()

@@ -13,17 +13,16 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sioms.reconcile.thresholds import AGREE, FEWEST_BLOCKS, OPEN, OVER, SERIOUS, SERIOUS_PLACE
+
 from .blocks import Block, Collector, Crossing
 from .causes import BY_NAME, Finding, judge
 from .moves import Cutter, Samples
-from .normal import FEWEST, Normal, estimate, learn
+from .normal import Normal, estimate, learn
 from .rows import PLAYS, Known, rows_of
 
 #: Blocks of the windows that are judged; the shortest comes first.
 WINDOWS = (3, 6, 12, 24)
-#: Judgements one after the other that agree before a drift is told with a name; with an open cause; and before it is
-#: over.
-AGREE, OPEN, OVER = 3, 9, 12
 #: An edge of the reference counts where the commanded speed was the same for so long [s], within this share of it.
 STEADY_S, STEADY = 0.03, 0.02
 #: ... or where it was changed all the same way, by this share of the axis's speed at least: then inertia says which
@@ -31,9 +30,6 @@ STEADY_S, STEADY = 0.03, 0.02
 PUSHED_S, PUSHED = 0.04, 0.1
 #: Blocks that are kept.
 KEPT = 400
-#: A drift is serious from this share of the usual force on, or where a place or a play changes by this share of the
-#: travel.
-SERIOUS, SERIOUS_PLACE = 0.35, 2e-3
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,7 +192,7 @@ class AxisWatch:
         self.blocks.append(block)
         if self.normal is None:
             first = self.blocks[0].start_s
-            enough = len(self.blocks) >= max(self.settings.learn_blocks, FEWEST)
+            enough = len(self.blocks) >= max(self.settings.learn_blocks, FEWEST_BLOCKS)
             if (enough and block.end_s - first >= self.settings.learn_s) or len(self.blocks) == KEPT:
                 self.normal = learn(list(self.blocks), self.about.travel, self.about.step)
                 self.blocks.clear()

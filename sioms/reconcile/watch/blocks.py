@@ -11,6 +11,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sioms.reconcile.thresholds import MASS_TOLD
+
 from .moves import Array
 from .rows import MASS, SIZE, Rows
 
@@ -18,8 +20,6 @@ from .rows import MASS, SIZE, Rows
 MOTION_S, MOVES, LONGEST_S = 20.0, 6, 3600.0
 #: Share of the moves that tell the least and the greatest mass; crossings that are kept of a block.
 EXTREME, MOST_CROSSINGS = 0.25, 64
-#: A mass is told by a move whose acceleration explains this many times what is left: to a percent.
-TOLD = 1e4
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +100,7 @@ def _block(moves: list[Rows], grams: list[Array], crossings: tuple[Crossing, ...
         left = (
             float(np.mean((rows.y - rows.x[:, keep[:-1]] @ others - mass * rows.x[:, MASS]) ** 2)) if own > 0 else 1.0
         )
-        if own > 0.0 and mass * mass * own > TOLD * left:
+        if own > 0.0 and mass * mass * own > MASS_TOLD * left:
             told.append(float(mass))
     told.sort()
     few = max(1, round(EXTREME * len(told)))

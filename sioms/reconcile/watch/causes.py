@@ -12,28 +12,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sioms.reconcile.thresholds import (
+    BEHIND_PLAY,
+    BENT,
+    CHANGED,
+    LEAVES,
+    NEEDED,
+    ONE_FLANK_STAYS,
+    PUSHED_APART,
+    RIVAL,
+    SMALLEST,
+    TOLD_PLAY,
+    YIELDS,
+)
+
 from .moves import Array
 from .normal import ALL_NAMES, PLACE, PLAY, SCALE, TOTAL, UNKNOWN, Estimate, Normal
 from .rows import CONSTANT, DRY, GAP, GIVE, LAG, MASS, PLAYS, SIZE, VISCOUS
 
-#: Energy of a change in units of its variance above which there is one.
-CHANGED = 30.0
-#: What a named cause may leave, and by how much more every other must leave.
-LEFT, RIVAL = 25.0, 16.0
-#: A second direction is needed where it explains so much more.
-NEEDED = 20.0
-#: A change bends the other numbers, too: by this share of its force.
-BENT = 0.05
-#: A play of at least this share of the smallest that has a column is seen, if at least this share of the mass is behind
-#: it.
-SMALLEST, BEHIND = 0.5, 0.15
-#: Edges that inertia moves apart are those of a play that makes their shift where that is twice the shift, but for this
-#: share, and where it is so many times its error; below that share it is none.
-TURNED = 0.4, 5.0
-#: Of a play of which one flank bears, twice the shift is the size to within this share.
-ONE_WAY = 0.1
-#: A reference tells a play whose standard deviation is such a share of it.
-TOLD_PLAY = 0.2
 #: What orders an unexplained change.
 ORDERED = {
     "mass": "acceleration", "viscous": "speed", "dry": "direction of motion", "constant": "nothing: it is constant",
@@ -153,9 +149,11 @@ def judge(normal: Normal, now: Estimate, travel: float) -> Finding:
     names = _names(lefts)
     one = _fit(ONE_FLANK, normal.theta, change, slack)
     others = [left for name, left in lefts.items() if name != ONE_FLANK.name]
-    if one[0] < LEFT and min(others) > one[0] + RIVAL and _behind(normal, now, change, travel)[0]:
+    if one[0] < LEAVES and min(others) > one[0] + RIVAL and _behind(normal, now, change, travel)[0]:
         names, loose[ONE_FLANK.name] = (ONE_FLANK.name,), one
-    if "place" in names:
+    if "backlash" in names and _is_no_play(normal, now, change):
+        names = tuple(name for name in names if name != "backlash")
+    if "place" in names or not names:
         names = _by_turns(names, normal, now, float(change[PLACE]))
     if names == ("place",) and not (_never_turned(normal, now, change) or _without_play(normal, now, change, travel)):
         names = (*names, "backlash")
@@ -180,13 +178,23 @@ def _by_turns(names: tuple[str, ...], normal: Normal, now: Estimate, place: floa
     """Name a shift of the reference backlash where edges moved apart by twice of it between one push and the other.
 
     A play of which one flank bears at steady speed shifts the edges there by half of it; inertia brings the other flank
-    to bear.
+    to bear, while with the other push the edge stays where steady speed leaves it. A transmission that yields more
+    moves it as far one way as the other. A play with a constant force on the load does not bounce as its columns do:
+    the edges tell it also where no cause explains the force.
     """
-    play, error = now.turned[0] - normal.turned, now.turned[1]
-    twice = 2.0 * abs(place)
-    if np.isfinite(play) and TURNED[1] * error < play and abs(play - twice) < TURNED[0] * twice + 2.0 * error:
-        return ("backlash",)
-    return names
+    back, forth, error = now.turned
+    play, twice = forth - back - normal.turned, 2.0 * abs(place)
+    nearer = min(abs(back - place), abs(forth - place))
+    apart = np.isfinite(play) and PUSHED_APART[1] * error < play and nearer < ONE_FLANK_STAYS * play
+    return ("backlash",) if apart and abs(play - twice) < PUSHED_APART[0] * twice + 2.0 * error else names
+
+
+def _is_no_play(normal: Normal, now: Estimate, change: Array) -> bool:
+    """Say whether edges are passed apart by the way, but not by the push, as of a reference that tells them late."""
+    back, forth, error = now.turned
+    play = abs(float(change[PLAY]))
+    told = now.noise[PLAY, PLAY] + normal.own[PLAY, PLAY] < (TOLD_PLAY * play) ** 2
+    return bool(told and abs(forth - back - normal.turned) + 2.0 * error < PUSHED_APART[0] * play)
 
 
 def _never_turned(normal: Normal, now: Estimate, change: Array) -> bool:
@@ -195,9 +203,12 @@ def _never_turned(normal: Normal, now: Estimate, change: Array) -> bool:
 
     Only where inertia outweighs the constant force on the axis: else the load may never leave its flank.
     """
-    play, error = abs(now.turned[0] - normal.turned), now.turned[1]
-    outweighs = BEHIND * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > abs(float(normal.theta[CONSTANT]))
-    return bool(outweighs and play + 2.0 * error < TURNED[0] * 2.0 * abs(float(change[PLACE])))
+    back, forth, error = now.turned
+    play = abs(forth - back - normal.turned)
+    outweighs = BEHIND_PLAY * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > abs(
+        float(normal.theta[CONSTANT])
+    )
+    return bool(outweighs and play + 2.0 * error < PUSHED_APART[0] * 2.0 * abs(float(change[PLACE])))
 
 
 def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -> bool:
@@ -220,7 +231,7 @@ def _behind(normal: Normal, now: Estimate, change: Array, travel: float) -> tupl
         return False, False
     plays = slice(GAP, GAP + len(PLAYS))
     information = np.linalg.inv((now.noise + normal.own)[plays, plays])
-    least = BEHIND * abs(float(normal.theta[MASS]))
+    least = BEHIND_PLAY * abs(float(normal.theta[MASS]))
     spans = []
     for way in _sizes(gap):
         known = float(way @ information @ way)
@@ -258,11 +269,11 @@ def _names(left: dict[str, float]) -> tuple[str, ...]:
             richer
             and richer in kept
             and kept.get(cause.name, np.inf) - kept[richer] < NEEDED
-            and kept[cause.name] < LEFT
+            and kept[cause.name] < LEAVES
         ):
             del kept[richer]
     order = sorted(kept, key=lambda name: kept[name])
-    if not order or kept[order[0]] > LEFT:
+    if not order or kept[order[0]] > LEAVES:
         return ()
     return tuple(name for name in order if kept[name] < kept[order[0]] + RIVAL)
 
@@ -280,8 +291,11 @@ def _size(
     play, known = now.theta[PLAY] - normal.theta[PLAY], now.noise[PLAY, PLAY]
     shift, unsure = 2.0 * abs(float(now.theta[PLACE] - normal.theta[PLACE])), now.noise[PLACE, PLACE]
     unsure = 2.0 * float(np.sqrt(unsure + normal.own[PLACE, PLACE]))
+    loose = now.loose - (normal.loose if np.isfinite(normal.loose) else 0.0)
+    if loose > max(abs(play), shift) + 4.0 * normal.scatter:  # at either flank, whichever way the axis goes
+        return loose, 1.96 * normal.scatter + YIELDS * loose
     if shift > abs(play) and unsure < TOLD_PLAY * shift:  # one flank bears: hardly ever the other does at steady speed
-        return shift, 1.96 * unsure + ONE_WAY * shift
+        return shift, 1.96 * unsure + YIELDS * shift
     known = float(np.sqrt(known + normal.own[PLAY, PLAY]))
     if known < TOLD_PLAY * abs(play):
         return float(play), 1.96 * known

@@ -119,6 +119,7 @@ def _normal(t: Mapping[str, Any], offset_s: float) -> Normal:
         _array(t, "theta"), own, _number(t["noise"]), _number(t["force"]), per, t["loads"] is True, _number(t["least"]),
         _number(t["most"]), tuple(_number(x) for x in t["edges"]), _number(t["scatter"]), _number(t["error"]),
         int(t["blocks"]), _number(t["until_s"]) - offset_s, _maybe(t.get("turned")),
+        _maybe(t.get("loose")),
     )  # fmt: skip
 
 

@@ -11,6 +11,26 @@ from itertools import pairwise
 
 import numpy as np
 
+from sioms.reconcile.thresholds import (
+    CARRIED,
+    DAY_S,
+    DEPENDENT,
+    FEW_PUSHED,
+    FEW_STEADY,
+    FEWEST_BLOCKS,
+    HEAT_DRY,
+    HEAT_VISCOUS,
+    IDLE_PLACE,
+    IDLE_SCALE,
+    IDLE_SHARE,
+    IDLE_STEPS,
+    MODEL_SHARE,
+    MOST_PLACE,
+    MOST_SCALE,
+    STUDENT,
+    UNSEEN,
+)
+
 from .blocks import Block, solved
 from .moves import Array
 from .rows import CONSTANT, DRY, GAP, MASS, NAMES, SIZE, VISCOUS
@@ -20,33 +40,10 @@ TOTAL = len(ALL_NAMES)
 PLACE, SCALE, PLAY = SIZE, SIZE + 1, SIZE + 2
 #: Blocks whose numbers together are compared, and the least number of such groups.
 GROUP, LEAST_GROUPS = 6, 10
-#: What is learnt from less than so many blocks is not believed.
-FEWEST = 20
-#: Changes below this share of the usual force are of no interest, whatever the number.
-IDLE_SHARE = 0.006
-#: The same for the place of a reference, of the travel and in steps of the encoder, and for its scale.
-IDLE_PLACE, IDLE_STEPS, IDLE_SCALE = 1e-5, 2.0, 2e-4
-#: Masses of moves that differ by this share of the least are of loads that change: cogging alone makes 4 %.
-LOADS = 0.08
-#: What varies in commissioning may vary by so many times as much (in variance): it has not seen everything.
-UNSEEN = 1.5
-#: A day's temperature changes friction by such a share (one standard deviation: some 2 % a kelvin of a grease's
-#: viscosity, a quarter of that for what is dry); a commissioning shorter than a day has not seen all of it.
-HEAT_VISCOUS, HEAT_DRY, DAY_S = 0.1, 0.025, 86400.0
-#: Neighbouring rows and the model's own errors leave fewer independent rows than there are: at least so many times.
-DEPENDENT = 2.0
-#: The model's own error, of the usual force, may look like any of its columns: what the moves hardly tell apart is not
-#: known better than it allows.
-MODEL_SHARE = 0.002
 #: Numbers by which blocks from before and after a change differ.
 FRICTIONS = (VISCOUS, DRY, CONSTANT)
 #: A variance beyond all: the number is not known.
 UNKNOWN = 1e12
-#: What place and play of a reference, of the travel, and its scale may be at most (one standard deviation): a pulley or
-#: an encoder that is a quarter off does not get into production.
-MOST_PLACE, MOST_SCALE = 0.1, 0.05
-#: Crossings under acceleration that are needed each way.
-FEW_PUSHED = 4
 #: Crossings within this share of the travel are of one edge.
 ONE_EDGE = 0.01
 
@@ -65,7 +62,8 @@ class Normal:
         edges: places of the reference's edges; scatter: of a crossing.
         error: mean square following error.
         blocks: learnt from; until_s: of the axis's clock.
-        turned: play that crossings show in which inertia pushes one way or the other; NaN where none tell it.
+        turned: play that crossings show in which inertia pushes one way or the other; loose: how far apart an edge is
+            passed at steady speeds; NaN where none tell it.
     """
 
     theta: Array
@@ -82,6 +80,7 @@ class Normal:
     blocks: int
     until_s: float
     turned: float = np.nan
+    loose: float = np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,7 +89,8 @@ class Estimate:
 
     A number that no move tells has UNKNOWN, one of the reference that no crossing tells the most that it may be.
     ``left`` is the mean square of force that the model leaves; ``gram`` and ``rows`` are of the blocks. ``turned`` is
-    the play that crossings show in which inertia pushes one way or the other, and its standard deviation.
+    where edges are passed while inertia pushes the load back and forth, off their places, and the standard deviation of
+    the difference; ``loose``: how far apart an edge is passed at steady speeds.
     """
 
     theta: Array
@@ -98,7 +98,8 @@ class Estimate:
     left: float
     gram: Array
     rows: int
-    turned: tuple[float, float] = (np.nan, np.inf)
+    turned: tuple[float, float, float] = (np.nan, np.nan, np.inf)
+    loose: float = np.nan
 
 
 def estimate(
@@ -136,26 +137,44 @@ def estimate(
     apart = max(_apart(blocks, loads, theta[list(FRICTIONS)]) - row, 0.0)
     cover[np.ix_(FRICTIONS, FRICTIONS)] += apart * inverse[np.ix_(few, few)]
     _refer(blocks, edges, scatter, travel, theta, cover)
-    return Estimate(theta, cover, left, gram, rows, _turned(blocks, edges, scatter))
+    return Estimate(theta, cover, left, gram, rows, _turned(blocks, edges, scatter), _loose(blocks, edges))
 
 
-def _turned(blocks: Sequence[Block], edges: Sequence[float], scatter: float) -> tuple[float, float]:
-    """Return by how much edges are passed elsewhere while the axis is accelerated one way and the other, and the
-    standard deviation of that.
+def _loose(blocks: Sequence[Block], edges: Sequence[float]) -> float:
+    """Return how far apart an edge is passed at steady speeds; NaN where there are too few.
+
+    A load that one flank pushes and the other brakes is passed at both, whichever way the axis goes; the mean of each
+    way lies between them.
+    """
+    places = np.array([c.place for b in blocks for c in b.crossings if abs(c.way) == 1])
+    if not edges or not len(places):
+        return np.nan
+    off = places[:, None] - np.array(edges)
+    nearest = np.abs(off).argmin(axis=1)
+    sides = [np.sort(off[nearest == k, k]) for k in range(len(edges))]
+    return max((float(side[-2] - side[1]) for side in sides if len(side) >= FEW_STEADY), default=np.nan)
+
+
+def _turned(blocks: Sequence[Block], edges: Sequence[float], scatter: float) -> tuple[float, float, float]:
+    """Return how far off edges are passed while the axis is accelerated backwards and forwards, and the standard
+    deviation of the difference.
 
     Inertia then holds the load at one flank or the other, whatever bears at steady speed; a shift of the reference is
     the same for both.
     """
     pushed = [(c.place, np.sign(c.way)) for b in blocks for c in b.crossings if abs(c.way) == 2]
     if not edges or not pushed:
-        return np.nan, np.inf
+        return np.nan, np.nan, np.inf
     places, ways = np.array(pushed, dtype=np.float64).T
     off = places - np.array(edges)[np.abs(places[:, None] - np.array(edges)).argmin(axis=1)]
     sides = [off[ways == way] for way in (-1.0, 1.0)]
     if min(map(len, sides)) < FEW_PUSHED:
-        return np.nan, np.inf
-    spread = max(float(np.sqrt(np.mean(np.concatenate([s - np.mean(s) for s in sides]) ** 2))), scatter)
-    return float(np.mean(sides[1]) - np.mean(sides[0])), spread * float(np.sqrt(sum(1.0 / len(s) for s in sides)))
+        return np.nan, np.nan, np.inf
+    free = sum(map(len, sides)) - 2
+    left = float(np.sum(np.concatenate([s - np.mean(s) for s in sides]) ** 2)) / free
+    spread = max(float(np.sqrt(left)), scatter) * (1.0 + STUDENT / free)
+    back, forth = (float(np.mean(side)) for side in sides)
+    return back, forth, spread * float(np.sqrt(sum(1.0 / len(s) for s in sides)))
 
 
 def _apart(blocks: Sequence[Block], loads: bool, together: Array) -> float:
@@ -219,13 +238,13 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     Raises:
         ValueError: there are too few.
     """
-    if len(blocks) < FEWEST:
-        raise ValueError(f"learn what is normal: {len(blocks)} blocks of motion; needs {FEWEST} or more")
+    if len(blocks) < FEWEST_BLOCKS:
+        raise ValueError(f"learn what is normal: {len(blocks)} blocks of motion; needs {FEWEST_BLOCKS} or more")
     least = np.array([b.least for b in blocks if np.isfinite(b.least)])
     most = np.array([b.most for b in blocks if np.isfinite(b.most)])
     low, high = (float(np.min(least)), float(np.max(most))) if len(least) else (0.0, 0.0)
     spread = float(np.median(most - least)) if len(least) else 0.0
-    loads = len(least) > 0 and spread > LOADS * abs(float(np.median(least)))
+    loads = len(least) > 0 and spread > CARRIED * abs(float(np.median(least)))
     edges, scatter = _edges(blocks, travel, step)
     whole = estimate(blocks, loads, edges, scatter, 0.0, travel)
     noise = _noise(blocks, loads, edges, scatter, whole.left)
@@ -238,6 +257,7 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     floor[:SIZE] = IDLE_SHARE * force / np.maximum(per, 1e-300)
     floor[[PLACE, PLAY]] = IDLE_PLACE * travel + IDLE_STEPS * step + scatter
     floor[SCALE] = IDLE_SCALE
+    back, forth, _ = whole.turned
     told = np.diag(whole.noise) < _limits(travel)  # what the reference does not tell is nothing by definition
     unseen = max(0.0, 1.0 - (blocks[-1].end_s - blocks[0].start_s) / DAY_S)
     heat = np.zeros(TOTAL)
@@ -246,7 +266,7 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     return Normal(
         theta, known + UNSEEN * own + np.diag(floor**2 + unseen * heat**2), noise, force, per, loads, low, high,
         edges, scatter, float(np.mean([b.error for b in blocks])), len(blocks), blocks[-1].end_s,
-        _turned(blocks, edges, scatter)[0],
+        forth - back, whole.loose,
     )  # fmt: skip
 
 

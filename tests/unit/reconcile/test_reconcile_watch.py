@@ -296,6 +296,51 @@ def test_a_play_of_which_one_flank_bears_is_named_where_reversals_prove_it() -> 
     assert judge(was, now(scale=0.01, gap1=1.0), 0.4).names == ()
 
 
+@pytest.mark.parametrize(
+    ("back", "forth", "names"),
+    [(-3e-4, 3e-4, ("backlash",)), (-6e-4, 0.0, ()), (-3.05e-4, -2.95e-4, ())],
+    ids=["play", "what yields", "no edge apart"],
+)
+def test_edges_tell_a_play_where_no_cause_explains_the_force(back: float, forth: float, names: tuple[str, ...]) -> None:
+    """A constant force on the load brings it back to its flank before the play is passed, which no column has.
+
+    Of a play one push leaves the edge where steady speed does; what yields moves it as far one way as the other.
+    """
+    was = replace(normal(), turned=0.0)
+    odd = now(place=-3e-4, gap2=1.7, dry=2.3, viscous=-11.5)
+    assert judge(was, odd, 0.4).names == ()
+    found = judge(was, replace(odd, turned=(back, forth, 5e-6)), 0.4)
+    assert found.names == names
+    if names:
+        assert found.low < 6e-4 < found.high < 7e-4
+
+
+def test_an_edge_that_is_told_late_is_no_play() -> None:
+    """It is passed apart by the way of the motion, but not by the push."""
+    was, late = replace(normal(), turned=0.0), now(play=4e-4)
+    assert judge(was, late, 0.4).names == ("backlash",), "without accelerated crossings nothing speaks against it"
+    assert judge(was, replace(late, turned=(-2e-4, 2e-4, 1e-5)), 0.4).names == ("backlash",)
+    found = judge(was, replace(late, turned=(-1e-5, 1e-5, 4e-5)), 0.4)
+    assert found.is_drift and not found.names
+
+
+def test_a_load_that_is_now_at_one_flank_now_at_the_other_tells_the_play_by_their_distance() -> None:
+    """The friction of the load is little: whichever way the axis goes, the mean edge is not that of a flank."""
+    rng = np.random.default_rng(3)
+    speeds, edge, gap = [0.05, 0.1, 0.2, 0.3], 0.03, 5e-4
+    was = learn(referred(blocks_at(rng, speeds * 5, 3.0), rng, (edge,)), 0.4, 1e-6)
+    flanks = [(-1, -0.5), (-1, -0.5), (-1, 0.5), (-1, 0.1), (1, 0.5), (1, 0.5), (1, 0.5), (1, -0.5)]
+    worn = [
+        replace(b, crossings=tuple(Crossing(edge + at * gap + 1e-6 * rng.standard_normal(), way) for way, at in flanks))
+        for b in blocks_at(rng, speeds, 3.0)
+    ]
+    seen = estimate(worn, False, was.edges, was.scatter, was.noise, 0.4)
+    assert abs(seen.theta[SIZE + 2]) < 0.8 * gap
+    found = judge(was, seen, 0.4)
+    assert found.names == ("backlash",)
+    assert found.size == pytest.approx(gap, rel=0.03) and found.low < gap < found.high
+
+
 def test_what_is_normal_is_known_no_better_than_its_noise_allows() -> None:
     errors = []
     for seed in range(12):
