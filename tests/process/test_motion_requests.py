@@ -394,7 +394,9 @@ def test_calibrate_and_zero_move_nothing(cell: sioms.Workcell, client: Callable[
 def test_what_commands_have_set_ends_with_their_client(cell: sioms.Workcell) -> None:
     """Gains of nothing, and a speed of nearly nothing, are not the next client's."""
     with cell.open("mod0.xaxis", "rw") as axis:
-        axis.write(sioms.command(0, position=0.0, k=0.0, kz=0.0, kp=0.0, kb=0.0, max_velocity=1e-4, max_acceleration=0.1))
+        axis.write(
+            sioms.command(0, position=0.0, k=0.0, kz=0.0, kp=0.0, kb=0.0, max_velocity=1e-4, max_acceleration=0.1)
+        )
         axis.wait_until_idle(5.0)
         assert axis.read().k[0] == 0.0
     with cell.open("mod0.xaxis", "rw", timeout=2.0) as axis:
