@@ -329,7 +329,8 @@ class Bank(ABC):
 
     def forget_settings(self, axes: AxesLike) -> None:
         """End what commands of these halted axes have set for those that follow: who set it has gone."""
-        chosen = self._forget(axes)
+        self._settle()
+        chosen = np.asarray(axes, dtype=np.int64)
         self._queue.forget_settings(chosen)
         self._settings_forgotten(chosen)
 

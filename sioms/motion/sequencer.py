@@ -12,7 +12,6 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,12 +19,13 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from . import modes
-from .arrival import Approach, Arrivals, plan_point
+from .arrival import Arrivals
 from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, SETTLING, STOP
-from .commands import Command, is_point_move
+from .commands import Command
 from .law import ControlLaw
 from .plan_step import STILL, Plans
-from .profile import Bounds, InfeasibleError, Plan, Planner, State, plan_force
+from .planning import Planned, Planning
+from .profile import InfeasibleError, State
 from .queue import CommandQueue
 from .settings import AxisSettings
 from .store import UNCUT_NS, PlanStore
@@ -44,15 +44,6 @@ _MOVING = AxisStatus.MOVING
 _FORCE, _STOPPING = _MOVING | AxisStatus.FORCE_MODE, _MOVING | AxisStatus.STOPPING
 _KIND_STATUS = np.array([0, _MOVING, _MOVING, _FORCE, _MOVING, _STOPPING, _MOVING], dtype=np.int64)
 _HOMING = int(AxisStatus.HOMING)
-
-
-class Planned(NamedTuple):
-    """The plan of a command and its kind; whether the play is taken up at its end, and that is to be looked at."""
-
-    plan: Plan
-    kind: int
-    taken: bool
-    looked_at: bool
 
 
 class Sequencer:
@@ -93,7 +84,6 @@ class Sequencer:
         self.kind, self.guard, self.status = law.kind, law.guard, law.event_status
         self.outcome = np.zeros(n, dtype=np.int64)
         self.stopped = np.zeros(n, dtype=bool)
-        self._velocity_limit, self._acceleration_limit = queue.in_force
         self.any_force = False
         self.any_guard = False
         self._queue = queue
@@ -102,7 +92,7 @@ class Sequencer:
         self._position = position
         self._velocity = velocity
         self._in_motion = in_motion
-        self._planner = Planner()
+        self.planning = Planning(settings, queue, store, law)
         self._row_kind = np.zeros(2 * n, dtype=np.int64)
         self._row_guard = np.zeros(2 * n, dtype=bool)
         self._row_command: list[Command | None] = [None] * (2 * n)
@@ -111,8 +101,6 @@ class Sequencer:
         self._row_checked = np.zeros(2 * n, dtype=bool)
         self._row_taken = np.zeros(2 * n, dtype=bool)
         self.arrivals = arrivals
-        self._approaches = [Approach.of(s) for s in settings]
-        self._start_velocity = [s.start_velocity for s in settings]
         self._hardest = np.array([s.acceleration_max for s in settings])
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
@@ -322,13 +310,10 @@ class Sequencer:
     def drive(self, axis: int, velocity: float, now_ns: int) -> None:
         """Go over to a velocity from the present state, outside the buffer and the soft limits (homing)."""
         one = np.array([axis])
-        command = Command._make([0.0] * len(Command._fields))
-        command = command._replace(control_mode=modes.VELOCITY, velocity=velocity)
         p, v, a = self.state(one, now_ns)[0].tolist()
         if self._law.tuned[axis]:
             p, v, a = float(self._law.brace(one)[0]), 0.0, 0.0
-        bounds = self._bounds(axis, command)._replace(minimum=-math.inf, maximum=math.inf)
-        self.store.put(int(self.store.row[axis]), self._planner.plan(command, (p, v, a), bounds))
+        self.store.put(int(self.store.row[axis]), self.planning.drive(axis, velocity, (p, v, a)))
         self._law.force_ends.end(one)
         self._run_now(one, RATE, now_ns)
 
@@ -443,24 +428,21 @@ class Sequencer:
         possible.
         """
         store, row = self.store, int(self.store.row[axis])
-        command, approach = self._row_command[row], self._approaches[axis]
-        if command is None or approach is None:
+        command, taken = self._row_command[row], bool(self._row_taken[row])
+        if command is None:
             return False
-        one, measured = np.array([axis]), float(self._position[axis])
+        one, measured, target = np.array([axis]), float(self._position[axis]), float(store.final[row, 0])
         start_ns, fraction = store.ended_at(one)
-        command = command._replace(
-            position=float(store.final[row, 0]), control_mode=command.control_mode & ~modes.RELATIVE
-        )
-        bounds, taken = self._bounds(axis, command), bool(self._row_taken[row])
         try:
-            approach = approach._replace(deadband=0.0)
-            plan, taken, _ = plan_point(self._planner, command, (measured, 0.0, 0.0), bounds, approach, taken)
+            planned = self.planning.planned_again(axis, command, measured, target, taken)
         except InfeasibleError:
             self._row_checked[row] = False
             return False
+        if planned is None:
+            return False
         self._law.anchor_at(axis, measured)
-        store.put(row, plan)
-        self._row_taken[row] = taken
+        store.put(row, planned.plan)
+        self._row_taken[row] = planned.taken
         store.begin(one, start_ns, fraction)
         return True
 
@@ -495,27 +477,10 @@ class Sequencer:
             self.arrivals.tries[axes] = 0
         self._todo.update(dict.fromkeys(axes.tolist()))
         for row in rows[self._row_sets[rows]].tolist():
-            self.put_in_force(row // 2, self._row_command[row])
+            self.planning.put_in_force(row // 2, self._row_command[row])
         self._queue.emit(EventKind.STARTED, axes, now_ns)
         self._settle_masks()
         self.refresh(axes)
-
-    def put_in_force(self, axis: int, command: Command | None) -> None:
-        """Put the gains, offset and limits that a command specifies in force; they stay."""
-        if command is None:
-            return
-        law, mode = self._law, command.control_mode
-        if mode & modes.GAINS:
-            law.command_gains(axis, (command.k, command.kz, command.kp, command.kb))
-        if mode & modes.FORCE_OFFSET:
-            law.offset[axis] = command.force_offset
-        if mode & modes.MAX_FORCE:
-            law.command_force(axis, command.max_force)
-        if mode & modes.MAX_VEL_ACC:
-            self._velocity_limit[axis] = command.max_velocity
-            self._acceleration_limit[axis] = command.max_acceleration
-            if self.kind[axis] == FORCE:
-                law.speed_most[axis] = command.max_velocity
 
     def _rest(self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
         """Nothing follows: hold the axes at rest, brake the others."""
@@ -612,34 +577,12 @@ class Sequencer:
         if command is None:
             return
         try:
-            planned = self.planned(axis, command, state, bool(self._row_taken[self.store.row[axis]]))
+            planned = self.planning.planned(axis, command, state, bool(self._row_taken[self.store.row[axis]]))
         except InfeasibleError as e:
             self._refuse(axis, str(e), now_ns)
             return
         self.put(axis, command, planned)
         self._ready[axis] = True
-
-    def planned(self, axis: int, command: Command, state: State, taken: bool) -> Planned:
-        """Return the plan of a command.
-
-        Args:
-            axis: whose.
-            command: what is asked for.
-            state: in which it begins.
-            taken: the play of the axis is taken up, if it stands there.
-
-        Raises:
-            InfeasibleError: it is not possible.
-        """
-        mode = command.control_mode
-        if mode & modes.ANY_FORCE:
-            return Planned(self._plan_force(axis, command), FORCE, False, False)
-        bounds, approach = self._bounds(axis, command), self._approaches[axis] if is_point_move(mode) else None
-        if approach is not None:
-            plan, taken, looked_at = plan_point(self._planner, command, state, bounds, approach, taken)
-            return Planned(plan, POSITION, taken, looked_at)
-        plan = self._planner.plan(command, state, bounds)
-        return Planned(plan, POSITION if mode & modes.POSITION else RATE, False, False)
 
     def put(self, axis: int, command: Command, planned: Planned) -> None:
         """Write a plan into the other row of its axis."""
@@ -651,20 +594,6 @@ class Sequencer:
         self._row_signals[row] = mode & modes.SIGNAL_MARKER != 0
         self._row_sets[row] = mode & modes.SETTINGS != 0
         self._row_checked[row], self._row_taken[row] = planned.looked_at, planned.taken
-
-    def _bounds(self, axis: int, command: Command) -> Bounds:
-        limits = self._limits
-        if command.control_mode & modes.MAX_VEL_ACC:
-            velocity, acceleration = command.max_velocity, command.max_acceleration
-        else:
-            velocity, acceleration = self._velocity_limit.item(axis), self._acceleration_limit.item(axis)
-        jerk, low, high = limits.jerk.item(axis), limits.minimum.item(axis), limits.maximum.item(axis)
-        return Bounds(velocity, acceleration, jerk, low, high, self._start_velocity[axis])
-
-    def _plan_force(self, axis: int, command: Command) -> Plan:
-        limit = command.max_force if command.control_mode & modes.MAX_FORCE else self._law.commanded_force(axis)
-        present = self.store.final[self.store.row[axis], 0] if self.kind[axis] == FORCE else self._law.output[axis]
-        return plan_force(command, float(present), limit)
 
     def _refuse(self, axis: int, text: str, now_ns: int) -> None:
         """A command turned out infeasible: drop the buffer and latch a fault; the axis brakes and holds."""

@@ -63,7 +63,7 @@ class ShortWay:
                 begin_step.look_at_state(plans, axis, now_ns)
                 position, velocity, acceleration = self._state.tolist()
                 taken = not replace and sequencer.is_taken_up(axis)
-                planned.append(sequencer.planned(axis, command, (position, velocity, acceleration), taken))
+                planned.append(sequencer.planning.planned(axis, command, (position, velocity, acceleration), taken))
         except InfeasibleError:
             return False
         ended = []
@@ -77,7 +77,7 @@ class ShortWay:
                 ended.append(axis)
             self._law.guard[axis] = each.plan.guard
             if command.control_mode & modes.SETTINGS:
-                sequencer.put_in_force(axis, command)
+                sequencer.planning.put_in_force(axis, command)
         if ended:
             queue.emit(EventKind.ENDED, np.array(ended), now_ns)
         queue.emit(EventKind.STARTED, np.array(axes), now_ns)

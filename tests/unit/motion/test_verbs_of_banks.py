@@ -29,6 +29,7 @@ VERBS: dict[str, Verb] = {
     "fault": lambda bank, now: bank.fault([0], "tried", now),
     "abandon": lambda bank, now: bank.abandon([0], now, errno.ERANGE, "tried"),
     "let_go": lambda bank, now: bank.let_go([1]),
+    "forget_settings": lambda bank, now: bank.forget_settings([1]),
     "ends": lambda bank, now: bank.ends()[1:],
     "lose_place": lambda bank, now: bank.lose_place([0], "tried", now),
     "break_off": lambda bank, now: bank.break_off([0], "tried", now),
