@@ -521,7 +521,8 @@ class Stops:
                 continue
             for channel, bit in channels_and_bits(runs):
                 if channel < block.n:
-                    self.stop_node(block, [channel], bit if block.spec.channels[channel].width else -1, source)
+                    part = bit if block.spec.channels[channel].width else -1
+                    self.stop_node(block, [channel], part, source, at_ns=0)  # when is known to the daemon
 
     def release(self) -> None:
         """Close the stop-request file, when the process goes on without this device."""

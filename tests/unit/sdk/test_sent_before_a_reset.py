@@ -214,6 +214,20 @@ def test_a_reset_by_the_daemon_undoes_no_stop_that_was_asked_for_on_a_handle_sin
     assert owner.served()[2:] == [None]
 
 
+def test_what_a_driver_starts_with_is_undone_by_a_reset_that_came_while_it_started(port: World) -> None:
+    """The daemon has judged that reset: it knows when the stop was asked for."""
+    sent_ns = CLOCK()
+    CLOCK.now_ns += LATER_NS
+    port.runtime.stops.restore([(port.runtime.blocks[0].spec.name, [[0, 0, 0b1000]], "eva", "io0")])
+    owner = Sender(port, port.open(0, [0], exclusive=True))
+    owner.set_bits(0b1000, 0b1000)
+    assert owner.served() == [errno.EPERM]
+    port.order(DriverVerb.NODE_RESET, 0, [0], -1, "eva", port.latch.resets, CLOCK(), sent_ns)
+    port.runtime.heed()
+    owner.set_bits(0b1000, 0b1000)
+    assert owner.served()[1:] == [None]
+
+
 def test_a_reset_of_the_workcell_undoes_no_stop_of_a_node_that_was_asked_for_since(axes: World) -> None:
     axes.latch.stop(CLOCK(), "eva")
     axes.runtime.heed()
