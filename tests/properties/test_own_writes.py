@@ -16,7 +16,8 @@ from typing import Any
 
 import pytest
 from daemon_rig import axes
-from own_writes_rig import CLOCK, DEVICE, Client, Device, OnLine, Pushing, World, worlds
+from own_writes_devices import Device, OnLine, Pushing
+from own_writes_rig import CLOCK, DEVICE, Client, World, worlds
 
 from sioms.client import shown
 from sioms.client.command import command

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from own_writes_rig import DEVICE, Client, Device, LineTable, Pushing, World, worlds
+from own_writes_devices import Device, LineTable, Pushing
+from own_writes_rig import DEVICE, Client, World, worlds
 
 from sioms.drivers.sim.tactile import SimTactile
 from sioms.protocol.flags import AnalogStatus, Request

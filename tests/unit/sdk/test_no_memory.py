@@ -15,7 +15,8 @@ from typing import Any
 
 import pytest
 from daemon_rig import axes
-from own_writes_rig import Device, OnLine, World, worlds
+from own_writes_devices import Device, OnLine
+from own_writes_rig import World, worlds
 
 from sioms.client.command import command
 from sioms.drivers.sim.axes import SimAxes

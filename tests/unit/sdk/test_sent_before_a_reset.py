@@ -9,7 +9,8 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
-from own_writes_rig import CLOCK, SENT, Client, Device, OnLine, World, own_time
+from own_writes_devices import Device, OnLine
+from own_writes_rig import CLOCK, SENT, Client, World, own_time
 
 from sioms.drivers.sim.axes import SimAxes
 from sioms.drivers.sim.io import SimIo
