@@ -12,7 +12,7 @@ from typing import Any
 
 from sioms.protocol import driver_verbs
 from sioms.protocol.stopfile import SOMEBODY
-from sioms.protocol.stopjournal import NODE, PID, node_entry, parts_of, workcell_entry
+from sioms.protocol.stopjournal import NODE, PID, asked_ns, node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
 from .cell import Cell
@@ -236,8 +236,8 @@ class Stops:
                 if number >= 0 and channel < len(channels := device.info.blocks[number].channels):
                     channels_of.setdefault((number, bit if channels[channel].width else -1), []).append(channel)
             for (number, bit), stopped in channels_of.items():
-                resets, now_ns = self._shared.latch.resets, time.monotonic_ns()
-                device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), resets, now_ns))
+                resets, at_ns = self._shared.latch.resets, asked_ns(entry, time.monotonic_ns())
+                device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), resets, at_ns))
                 self._shared.latch.ordered()
             self._cell.log("warning", "emergency stop", node=entry[NODE], source=entry["by"], heard_by=entry[PID])
 
