@@ -19,6 +19,7 @@ from sioms.gateway.core import (
 )
 from sioms.gateway.parts import Principal
 from sioms.protocol import link, verbs
+from sioms.protocol.flags import Request
 from sioms.protocol.link import Down, Up
 from sioms.protocol.messages import decode, decode_reply, refusal, reply
 
@@ -168,6 +169,20 @@ def test_the_driver_is_told_how_old_its_clients_word_is_so_that_a_gateway_that_f
     assert all(step_ns < after - before <= 30 * MS for before, after in itertools.pairwise(since[1:]))
     assert world.now_ns - since[-1] < 30 * MS and len(since) < 40, "often enough, and not with each packet"
     assert set(said(node)) == {WRITE}, "nothing that renews from now on"
+
+
+def test_how_old_the_resets_of_a_client_are_is_told_to_driver_and_daemon(world: World) -> None:
+    """On a reader's handle, too, which has no lease, and by who has not been told any time yet."""
+    line = world.begin(b"a")
+    node, told_ns = world.open(b"a", 5, read_only=True), world.told(b"a")
+    reset = verbs.Ioctl(Request.RESET, None, None).packed(7)
+    world.now_ns += 190 * MS
+    world.frame(b"a", Up.PACKET, 5, reset, stamp_ns=told_ns)
+    assert node.got == [verbs.Heard(told_ns).packed(), reset]
+    for stamp_ns, said_ns in ((told_ns, told_ns), (0, 1)):
+        count = len(line.got)
+        world.frame(b"a", Up.PACKET, 0, verbs.Reset("mod0").packed(9), stamp_ns=stamp_ns)
+        assert line.got[count:] == [verbs.Said(said_ns).packed(), verbs.Reset("mod0").packed(9)]
 
 
 @pytest.mark.parametrize(
