@@ -19,9 +19,13 @@ BACK_S = 12.0
 MORE_S = 6.0
 LEAST = 4
 """Messages bent or readings seen, without which a disturbance goes on for up to MORE_S [s]."""
+JUDGED = 2
+"""Readings without which a disturbance goes on as well, where they are judged."""
 LOST_S = 15.0
 LEAST_RECOVERY_S = 0.005
 LATE_TIMEOUT_S = 3.0
+LATE_SHARE = 0.1
+"""Of replies: of 0.3 a poll of seven reads nothing, and an opening of twenty does not come to its end."""
 SPARSE = 200.0
 """Random bytes a second that leave most messages whole."""
 RATIO = 1.3
@@ -57,9 +61,10 @@ def disturbed(station: Station, seconds: float, *, judge: bool = True, babble: f
         station.fault(**faults)
         calm.watch(seconds)
         deadline = time.monotonic() + MORE_S
-        # a busy machine lets few messages pass: wait until the trial has tried something
+        # a busy machine lets few messages pass: wait until the trial has tried something, and seen what came of it
         while not babble and time.monotonic() < deadline:
-            if (calm.count if "chop" in faults else _bent_since(station, bent)) >= LEAST:
+            tried = calm.count if "chop" in faults else _bent_since(station, bent)
+            if tried >= LEAST and (calm.count >= JUDGED or not judge):
                 break
             calm.watch(0.1)
         station.fault()
@@ -188,7 +193,7 @@ def late(station: Station, full: bool) -> str:
     low, high = timeout_s + 0.1 * most_s, timeout_s + 0.9 * most_s
     before = dict(station.totals())
     seconds = max((8.0 if full else 1.5), 4 * timeout_s)
-    calm = disturbed(station, seconds, late=0.3, late_s=(low, high))
+    calm = disturbed(station, seconds, late=LATE_SHARE, late_s=(low, high))
     bent = _bent_since(station, before["bent"])
     if not bent:
         raise NotApplicable("no message of the device passed meanwhile")
