@@ -132,7 +132,12 @@ library = _load()
 """The compiled steps; None: they run as Python."""
 
 
-class Record:
+ADDRESS = "address_of_"
+"""What the fields of a record are called in C that point to arrays and other records."""
+NOT_FIELDS = ("kinds", "in_c", *get_type_hints(ctypes.Structure))
+
+
+class Record(ctypes.Structure):
     """Numbers and arrays that steps work on, declared by annotations: int, float, arrays of ARRAYS, records.
 
     Args:
@@ -143,16 +148,19 @@ class Record:
     """
 
     kinds: ClassVar[dict[str, Any]]
-    layout: ClassVar[Any]
+    in_c: ClassVar[bool]
 
     def __init_subclass__(cls) -> None:
-        cls.kinds = {name: kind for name, kind in get_type_hints(cls).items() if name not in ("kinds", "layout")}
-        if library is not None:
-            fields = [(name, NUMBERS.get(kind, ctypes.c_void_p)) for name, kind in cls.kinds.items()]
-            cls.layout = type(cls.__name__, (ctypes.Structure,), {"_fields_": fields})
-            for name, kind in cls.kinds.items():
-                if kind in NUMBERS:
-                    setattr(cls, name, _Number(name))
+        cls.in_c = library is not None
+        cls.kinds = {name: kind for name, kind in get_type_hints(cls).items() if name not in NOT_FIELDS}
+
+    def __new__(cls, **_: Any) -> Self:
+        if cls.in_c and "_fields_" not in cls.__dict__:  # it can only be set when the class is complete
+            cls._fields_ = [
+                (name, NUMBERS[kind]) if kind in NUMBERS else (ADDRESS + name, ctypes.c_void_p)
+                for name, kind in cls.kinds.items()
+            ]
+        return super().__new__(cls)
 
     def __init__(self, **fields: Any) -> None:
         name = type(self).__name__
@@ -165,23 +173,19 @@ class Record:
                 if not isinstance(value, np.ndarray) or value.dtype != _DTYPES[kind] or not value.flags.c_contiguous:
                     wanted = kind.dtype.__name__
                     raise TypeError(f"make {name}: {field} is {value!r:.80}; want a contiguous array of {wanted}")
-        if library is None:
+        if not self.in_c:
             for field, value in fields.items():
                 setattr(self, field, value.reshape(-1).data if self.kinds[field] in ARRAYS else value)
             return
-        self.made = self.layout()
-        self.pointer = ctypes.addressof(self.made)
         for field, value in fields.items():
-            if self.kinds[field] in NUMBERS:
-                setattr(self.made, field, value)
-            else:
-                self.__dict__[field] = value  # it lives as long as what points to it
-                setattr(self.made, field, _address(value))
+            setattr(self, field, value)  # an array lives as long as what points to it
+            if self.kinds[field] not in NUMBERS:
+                setattr(self, ADDRESS + field, _address(value))
 
     @property
     def address(self) -> int:
         """A number by which steps find the record in an array of such, as long as it is kept elsewhere."""
-        _records[number := self.pointer if library is not None else id(self)] = self
+        _records[number := ctypes.addressof(self) if self.in_c else id(self)] = self
         return number
 
     @classmethod
@@ -204,26 +208,13 @@ def record_of(address: int) -> Record:
     return _records[address]
 
 
-class _Number:
-    """A number of a record that lives in C."""
-
-    def __init__(self, name: str) -> None:
-        self.name = name
-
-    def __get__(self, record: Any, _: Any) -> Any:
-        return getattr(record.made, self.name)
-
-    def __set__(self, record: Any, value: Any) -> None:
-        setattr(record.made, self.name, value)
-
-
 def _address(value: Any) -> int:
     if isinstance(value, Record):
-        return value.pointer
+        return ctypes.addressof(value)
     if isinstance(value, np.ndarray):
         address: int = value.__array_interface__["data"][0]
         return address
-    return ctypes.cast(value.compiled, ctypes.c_void_p).value or 0
+    return ctypes.cast(value, ctypes.c_void_p).value or 0
 
 
 def step(function: F) -> F:
@@ -233,24 +224,12 @@ def step(function: F) -> F:
     compiled: Any = library[PREFIX + function.__name__]
     hints = get_type_hints(function)
     compiled.restype = NUMBERS.get(hints.pop("return"))
-    compiled.argtypes = [NUMBERS.get(kind, ctypes.c_void_p) for kind in hints.values()]
-    call: Any = compiled
-    if hints and issubclass(next(iter(hints.values())), Record):
-        call = _of_record(compiled, len(hints))
-        call.compiled = compiled
-    return cast("F", call)
+    compiled.argtypes = [_argument(kind) for kind in hints.values()]
+    return cast("F", compiled)
 
 
-def _of_record(compiled: Any, arguments: int) -> Any:
-    """Return a function of a record; without a loop, because it runs in every tick."""
-
-    def one(record: Any) -> Any:
-        return compiled(record.pointer)
-
-    def two(record: Any, other: Any) -> Any:
-        return compiled(record.pointer, other)
-
-    def more(record: Any, *others: Any) -> Any:
-        return compiled(record.pointer, *others)
-
-    return {1: one, 2: two}.get(arguments, more)
+def _argument(kind: Any) -> Any:
+    """Return what ctypes has for an argument: of a record its address, which it takes itself."""
+    if isinstance(kind, type) and issubclass(kind, Record):
+        return ctypes.POINTER(kind)
+    return NUMBERS.get(kind, ctypes.c_void_p)

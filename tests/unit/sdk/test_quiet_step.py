@@ -49,13 +49,7 @@ from sioms.sdk.serve_step import Desk, StopFile
 
 PERIOD_NS, LEASE_NS = 1_000_000, 60_000_000_000
 STEP = ctypes.CFUNCTYPE(ctypes.c_int64, ctypes.c_void_p, ctypes.c_int64, ctypes.c_int64, ctypes.c_int64)
-
-
-class Function:
-    """A function of Python that compiled steps can call."""
-
-    def __init__(self, function):
-        self.compiled = STEP(function)
+"""Of a function of Python that compiled steps can call."""
 
 
 class Device:
@@ -89,7 +83,7 @@ class Device:
             ("rest", self._rest),
             ("stop", self._stop),
         ):
-            given[name] = function if library is None else Function(function)
+            given[name] = function if library is None else STEP(function)
         self.quiet = Quiet(**{**given, **fields})
 
     def _tick(self, _device, scheduled_ns, as_of_ns, number):
