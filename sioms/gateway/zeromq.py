@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import zmq
 
 from sioms.client.keys import Folder, Pair
+from sioms.client.zeromq import READABLE
 from sioms.protocol import link
 
 from .connections import PROOF_S, Connection, Connections, Strangers
@@ -94,13 +95,13 @@ class ZeroMq:
     @property
     def pending(self) -> bool:
         """Whether frames wait: sending takes the edge off the descriptor of what has come."""
-        return bool(int(self._router.getsockopt(zmq.EVENTS)) & zmq.POLLIN)
+        return bool(int(self._router.getsockopt(zmq.EVENTS)) & READABLE)
 
     def take(self) -> bool:
         """Take frames of clients; return whether there are more."""
         router, known, gateway = self._router, self._known, self._gateway
         for _ in range(TURN):
-            if not int(router.getsockopt(zmq.EVENTS)) & zmq.POLLIN:
+            if not int(router.getsockopt(zmq.EVENTS)) & READABLE:
                 return False
             peer = router.recv()
             if peer in known and peer in gateway.sessions:
