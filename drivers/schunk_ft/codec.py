@@ -137,14 +137,14 @@ def status_text(status: int) -> str:
 
 
 def act(command: Command, *arguments: int, timeout_s: float = TIMEOUT_S) -> Exchange:
-    """Return the exchange of a command without data in its reply.
+    """Return the exchange of a command without data in its reply; each sets a state, and may be sent twice.
 
     Example:
         >>> act(Command.START).data.hex(" ")
         'ff ff 00 00 01 00 40'
     """
     what = command.name.lower().replace("_", " ") + "".join(f" {each}" for each in arguments)
-    return _exchange(bytes((command, *arguments)), lambda data: None, what, False, timeout_s)
+    return _exchange(bytes((command, *arguments)), lambda data: None, what, True, timeout_s)
 
 
 def get(parameter: tuple[int, int], timeout_s: float = TIMEOUT_S) -> Exchange:

@@ -27,7 +27,7 @@ class SideConnection:
         self.settings = settings
         self._connection: Connection | None = None
         self._exchange: Exchange | None = None
-        self._sent = False
+        self._sent = self._is_kept = False
         self._reply = bytearray()
         self._until_ns = 0
 
@@ -36,6 +36,7 @@ class SideConnection:
         if self._exchange is not None or not self._is_alive():
             self.close()
         self._exchange, self._sent = exchange, False
+        self._is_kept = self._connection is not None
         self._reply.clear()
         self._until_ns = now_ns + int(self.settings.connect_timeout_s * 1e9)
 
@@ -55,7 +56,7 @@ class SideConnection:
         try:
             found = None
             if self._sent:
-                found = self._receive(exchange)
+                found = self._receive(exchange, now_ns)
             else:
                 self._transmit(exchange, now_ns)
         except OSError as error:
@@ -99,7 +100,7 @@ class SideConnection:
             self._sent = True
             self._until_ns = now_ns + int(exchange.timeout_s * 1e9)
 
-    def _receive(self, exchange: Exchange) -> tuple[Any] | None:
+    def _receive(self, exchange: Exchange, now_ns: int) -> tuple[Any] | None:
         if self._connection is None:
             raise OSError(errno.ENOTCONN, f"{self.settings} is not connected")
         try:
@@ -107,6 +108,11 @@ class SideConnection:
         except OSError:
             self._connection.close()
             self._connection = None
+            if self._is_kept and exchange.repeatable and not self._reply:
+                # the other side was ending it when this was sent, and nothing could tell: ask on a new one
+                self._sent = self._is_kept = False
+                self._until_ns = now_ns + int(self.settings.connect_timeout_s * 1e9)
+                return None
             return (exchange.decode(bytes(self._reply)),)  # the end of the connection may be the end of the reply
         size = exchange.want(bytes(self._reply))
         if size is None or len(self._reply) < size:

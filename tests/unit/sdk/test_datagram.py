@@ -6,6 +6,7 @@ import errno
 import socket
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -234,4 +235,43 @@ def test_what_was_given_up_is_not_answered_later(server: socket.socket) -> None:
             while (found := side.advance(3)) is None:
                 pass
             assert found == (b"good",)
+    side.close()
+
+
+@pytest.mark.parametrize("repeatable", [True, False])
+def test_a_connection_that_ends_while_it_is_asked_is_made_anew(server: socket.socket, repeatable: bool) -> None:
+    """The other side hangs up between the look whether it is there, and the request; what may be repeated is."""
+    side = SideConnection(LineSettings(tcp=name_of(server), connect_timeout_s=100.0))
+    ask = replace(word(b"a", 100.0), repeatable=repeatable)
+
+    def answered(made: socket.socket) -> Any:
+        while not is_readable(made, 0.001):
+            side.advance(2)
+        assert made.recv(100) == ask.data
+        made.sendall(b"good")
+        while (found := side.advance(3)) is None:
+            pass
+        return found
+
+    side.begin(ask, 0)
+    side.advance(1)
+    with server.accept()[0] as first:
+        assert answered(first) == (b"good",)
+        side.begin(ask, 4)  # it is still there
+    if not repeatable:
+        with pytest.raises(LinkError):
+            while True:
+                side.advance(5)
+        return
+    server.settimeout(0.001)
+    while True:
+        side.advance(5)
+        try:
+            second = server.accept()[0]
+            break
+        except TimeoutError:
+            continue
+    with second:
+        second.settimeout(5.0)
+        assert answered(second) == (b"good",)
     side.close()
