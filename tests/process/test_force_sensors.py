@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import minimalmodbus
+import numpy as np
 import pytest
 from conftest import PATIENCE_S
 from daemon_rig import raises, wait_for
@@ -45,11 +46,19 @@ class Sensor(Wire):
         return node
 
 
+UNREAD = 1 << 30
+"""No flags of a reading."""
+
+
 def shows(node: Any, expected: tuple[float, ...], what: str) -> None:
-    wait_for(
-        lambda: node.read().data == pytest.approx(expected, abs=0.5),
-        f"{what}: {expected}, not {node.read().data}",
-    )
+    """Wait for a reading; one that is refused is that of a simulator which had to wait for a processor (0.16 s)."""
+
+    def shown() -> bool:
+        with contextlib.suppress(OSError):
+            return bool(node.read().data == pytest.approx(expected, abs=0.5))
+        return False
+
+    wait_for(shown, f"{what}: {expected}")
 
 
 def stream(node: Any) -> Any:
@@ -57,7 +66,10 @@ def stream(node: Any) -> Any:
 
 
 def flags(node: Any) -> int:
-    return int(node.read().flags[0])
+    """Return the flags of a reading, UNREAD while there is none: see ``shows``."""
+    with contextlib.suppress(OSError):
+        return int(node.read().flags[0])
+    return UNREAD
 
 
 def lost_and_back(wire: Sensor, cause: str, words: str, cure: str = "clear") -> None:
@@ -90,7 +102,8 @@ def test_ft300_streams_through_damage_loss_and_deaths(start: Callable[..., Any],
         number = node.read().number
         node.wait_new(number + 50, 5.0)
         stamps = [snapshot.stamp_ns for snapshot in node.history(number)]
-        assert (stamps[-1] - stamps[0]) / (len(stamps) - 1) == pytest.approx(10e6, rel=0.1)
+        # the usual distance: 50 ms without a processor at either end are 10 % of their mean
+        assert np.median(np.diff(stamps)) == pytest.approx(10e6, rel=0.1)
         node.zero(20)
         shows(node, (0.0,) * 6, "zeroed in software")
         wire.tell("noise 3")
