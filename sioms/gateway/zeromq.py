@@ -30,6 +30,8 @@ QUEUE = 1000
 QUEUE_IN = 200
 """Frames of a client that wait to be taken, at most; more wait at the client."""
 HANDSHAKE_MS = 2000
+MORE, LAST = int(zmq.SNDMORE | zmq.DONTWAIT), int(zmq.DONTWAIT)
+"""How the parts of a frame are sent: whole, or not at all, which the first part tells."""
 
 
 def secured(context: zmq.Context[zmq.Socket[bytes]], kind: int, pair: Pair) -> zmq.Socket[bytes]:
@@ -86,7 +88,8 @@ class ZeroMq:
     def send(self, peer: bytes, frame: bytes) -> bool:
         """Send a frame to a client; return False if it has disconnected or its queue is full."""
         try:
-            self._router.send_multipart((peer, frame), zmq.DONTWAIT)
+            self._router.send(peer, MORE)
+            self._router.send(frame, LAST)
         except zmq.ZMQError:
             self._known.pop(peer, None)
             return False
