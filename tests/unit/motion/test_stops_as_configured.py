@@ -153,6 +153,25 @@ def test_what_was_to_press_gently_does_not_press_harder_for_a_stop(way: float, s
     assert rig.bank.is_idle(rig.axes) and plant.velocity == pytest.approx(0.0, abs=1e-3)
 
 
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop"))
+@pytest.mark.parametrize(("most", "pull"), ((0.5, -1.0), (0.5, -3.0), (2.0, -2.2)))
+def test_a_load_that_the_allowed_force_does_not_carry_is_held(most: float, pull: float, stop: str) -> None:
+    """It goes up when it is stopped, and comes down at once."""
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant)
+    rig.write(mode=VELOCITY, velocity=0.3)
+    rig.tick(300)
+    plant.pull = pull
+    rig.write(mode=VELOCITY | MAX_FORCE, velocity=0.3, max_force=most, replace=True)
+    rig.tick(5)
+    getattr(rig.bank, stop)(rig.axes, rig.now_ns)
+    rig.tick(1500)
+    place = plant.position
+    rig.tick(1000)
+    assert abs(plant.velocity) < 1e-3
+    assert abs(plant.position - place) < 1e-3
+
+
 @pytest.mark.parametrize(
     "gains", ({"k": 0.0}, {"k": -500.0}, {"k": 1000.0, "kb": 3.0}, {"k": 900.0, "kp": -0.99}), ids=str
 )
