@@ -18,6 +18,9 @@ Order = tuple[int, bool, float]
 
 D = COORDINATES.index("d")
 _TURNS = tuple(unit == "rad" for unit in UNITS)
+_BAND = {"m": 3e-4, "rad": 0.01}
+"""Errors that are let be while something is held [m, rad]. It sticks to the platen: rates that are to bring a small
+error back add up to a set-point that is ever farther away, until it jumps, each time farther."""
 
 
 class Follower:
@@ -46,6 +49,8 @@ class Follower:
         for axis, (rate, to, at, turns) in enumerate(zip(along, goal, now, _TURNS, strict=True)):
             if axis != D:
                 error = math.remainder(to - at, math.tau) if turns else to - at
+                if touches:
+                    error -= min(max(error, -_BAND[UNITS[axis]]), _BAND[UNITS[axis]])
                 found.append((axis, False, rate + k * error))
             elif touches:
                 found.append((axis, True, setpoint.force))

@@ -29,3 +29,12 @@ def test_a_force_is_not_bounded_by_a_velocity() -> None:
     for _ in range(200):
         orders = follower.orders(Setpoint(HERE, (0.0,) * 6, 2.0), HERE, 1.0, 2.5e-3)
     assert orders[D] == (D, True, 2.0)
+
+
+def test_small_errors_of_what_is_held_are_let_be() -> None:
+    """What comes of it shows tests/physics/test_hand_hunting.py."""
+    goal = (HERE[0] + 2e-4, HERE[1] - 1e-3, HERE[2] + 0.009, HERE[3], HERE[4] - 0.02, HERE[5])
+    free, held = (Follower().orders(Setpoint(goal, (0.0,) * 6, 1.0), HERE, force, 2.5e-3) for force in (0.0, 1.0))
+    rates = {axis: rate for axis, presses, rate in held if not presses}
+    assert rates == pytest.approx({0: 0.0, 1: -5.0 * 7e-4, 2: 0.0, 4: -5.0 * 0.01, 5: 0.0})
+    assert [rate for axis, _, rate in free if axis != D] == pytest.approx([1e-3, -5e-3, 0.045, -0.1, 0.0])
