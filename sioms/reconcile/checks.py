@@ -20,6 +20,8 @@ OTHER_UNIT = 30.0
 #: Measured may be so many times the commanded force; samples it is judged on, their share of the largest force, and
 #: seconds of a mean.
 FORCE_SCALE, LEAST_SLOW, SLOW_SHARE, SLOW_S = 1.33, 200, 0.8, 0.05
+#: A log in which more of the steps than this are off by half was polled: there is no place to cut it at.
+POLLED = 0.05
 #: Share of samples at the controller's limit above which nothing is left to learn, and above which it is said.
 SATURATED, OFTEN = 0.9, 0.5
 
@@ -125,6 +127,12 @@ def _check_time(r: Record, time: Array, dt: float) -> None:
         raise BadInputError(f"read record {r.name}: time steps are {typical:.6g} s, the model says {dt:.6g} s{hint}")
     odd = np.flatnonzero(np.abs(steps - typical) > 0.5 * typical)
     if len(odd):
+        if len(odd) > POLLED * len(steps):
+            raise BadInputError(
+                f"read record {r.name}: it was polled at no fixed rate, in steps of {steps.min():.4g} to "
+                f"{steps.max():.4g} s ({100 * len(odd) / len(steps):.0f} % of them are off by more than half of "
+                f"{typical:.4g} s); needs what the drive, or its driver, samples at a fixed rate"
+            )
         i = int(odd[0])
         raise BadInputError(
             f"read record {r.name}: time jumps by {steps[i]:.6g} s after sample {i} ({len(odd)} jumps); "

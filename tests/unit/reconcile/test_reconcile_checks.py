@@ -49,7 +49,14 @@ def _jump(r: Record) -> Record:
     return replace(r, time_s=t)
 
 
+def _polled(r: Record) -> Record:
+    """Take some rows, as a program does that asks over a line beside other work."""
+    rows = np.cumsum(np.random.default_rng(2).choice([1, 1, 1, 1, 6], len(r) // 3))
+    return r.only(rows[rows < len(r)])
+
+
 BAD = {
+    "polled": (_polled, "polled at no fixed rate"),
     "too short": (lambda r: r.cut(0, 200), "too few"),
     "no motion": (lambda r: replace(r, position=np.zeros(len(r)), command=None), "no motion"),
     "constant force": (lambda r: replace(r, force=np.ones(len(r))), "force is constant"),
