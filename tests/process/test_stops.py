@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 from daemon_rig import WORKCELL, Client, Daemon, Waiting, at_rest, has_ended, jog, raises, wait_for
@@ -125,6 +126,11 @@ def test_stop_through_the_request_page_while_the_daemon_hangs(daemon: Daemon, ce
     cell.reset()
 
 
+def waited(pid: int) -> float:
+    """Return how long a process has waited for a processor [s], also when it has ended and nobody has looked."""
+    return int(Path(f"/proc/{pid}/schedstat").read_text().split()[1]) / 1e9
+
+
 @pytest.mark.parametrize(("module", "words"), [("sdev", ["-e"]), ("front", ["stop"])])
 def test_a_fresh_stop_while_the_daemon_hangs_stays_latched(
     daemon: Daemon, cell: sioms.Workcell, module: str, words: list[str]
@@ -139,11 +145,16 @@ def test_a_fresh_stop_while_the_daemon_hangs_stays_latched(
             env={**os.environ, "SIOMS_SOCKET": daemon.socket}, stderr=subprocess.PIPE, text=True,
         )  # fmt: skip
         wait_for(lambda: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "latched", 20.0)
-        latched_s = time.monotonic() - began
+        latched_s, waited_s = time.monotonic() - began, waited(tool.pid)
         at_rest(axis, 1.0)
+        os.waitid(os.P_PID, tool.pid, os.WEXITED | os.WNOWAIT)
+        took_s = time.monotonic() - began
+        # it imports the client library meanwhile, for which a busy machine gives it no processor
+        waited_s = waited(tool.pid) - waited_s
         _, said = tool.communicate(timeout=20.0)
         assert tool.returncode == 0, said
-        assert time.monotonic() - began < latched_s + 1.5, "what is latched is told at once"
+        print(f"told {took_s - latched_s:.2f} s after it was latched, {waited_s:.2f} s without a processor")
+        assert took_s - waited_s < latched_s + 1.5, "what is latched is told at once"
         assert "stopped and latched by the drivers; hello: the daemon does not answer" in said
     print(f"start of {module} to latched: {latched_s * 1e3:.0f} ms")
     wait_for(lambda: f"pid {tool.pid}" in cell.status()["stop_source"], "the daemon knows who")
