@@ -155,12 +155,17 @@ class Record(ctypes.Structure):
         cls.kinds = {name: kind for name, kind in get_type_hints(cls).items() if name not in NOT_FIELDS}
 
     def __new__(cls, **_: Any) -> Self:
-        if cls.in_c and "_fields_" not in cls.__dict__:  # it can only be set when the class is complete
+        cls.lay_out()
+        return super().__new__(cls)
+
+    @classmethod
+    def lay_out(cls) -> None:
+        """Give the structure its fields, once; that can only be done when the class is complete."""
+        if cls.in_c and "_fields_" not in cls.__dict__:
             cls._fields_ = [
                 (name, NUMBERS[kind]) if kind in NUMBERS else (ADDRESS + name, ctypes.c_void_p)
                 for name, kind in cls.kinds.items()
             ]
-        return super().__new__(cls)
 
     def __init__(self, **fields: Any) -> None:
         name = type(self).__name__
@@ -231,5 +236,6 @@ def step(function: F) -> F:
 def _argument(kind: Any) -> Any:
     """Return what ctypes has for an argument: of a record its address, which it takes itself."""
     if isinstance(kind, type) and issubclass(kind, Record):
+        kind.lay_out()  # now, where drivers are forked from: they share it
         return ctypes.POINTER(kind)
     return NUMBERS.get(kind, ctypes.c_void_p)
