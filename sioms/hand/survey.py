@@ -97,8 +97,9 @@ def settings(count: int, loads: Sequence[float] = LOADS_N, start: float = 0.0, s
         start: direction about which they lie [rad].
         seed: of the angles of the fingers.
     """
-    if not loads or min(loads) <= 0.0:
-        raise ValueError(f"survey object: forces {list(loads)} N; want some above 0")
+    most = Manner().most_n
+    if not loads or not all(0.0 < load < most for load in loads):
+        raise ValueError(f"survey object: forces {list(loads)} N; want some above 0 and below {most:g} N, an overload")
     random, (low, high) = np.random.default_rng(seed), PHI
     turns = start + PSI * np.sin(np.linspace(0.0, 2.0 * math.pi, count, endpoint=False))
     ranks = [random.permutation(count) for _ in range(2)]

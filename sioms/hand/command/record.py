@@ -199,12 +199,14 @@ def hidden(path: Path | None) -> tuple[Any, tuple[float, float]]:
         raise ValueError(f"read {path}: nobody reads {', '.join(odd)}; known are {', '.join(FINGERS)}")
     mounts, turned = [], []
     for name in FINGERS:
-        keys = dict(table.get(name, {}))
-        turned.append(float(keys.pop("turned_rad", 0.0)))
         try:
+            keys = dict(table.get(name, {}))
+            turned.append(float(keys.pop("turned_rad", 0.0)))
             mounts.append(Mount(**keys))
-        except TypeError as error:
+        except (TypeError, ValueError) as error:
             raise ValueError(f"read {path}, {name}: {error}") from None
+        if not abs(turned[-1]) <= math.pi:
+            raise ValueError(f"read {path}, {name}: turned_rad is {turned[-1]:g}; want an angle within pi")
     return (mounts[0], mounts[1]), (turned[0], turned[1])
 
 

@@ -117,8 +117,11 @@ def test_a_cell_records_what_encoders_read_and_not_where_the_hand_knows_its_join
 @pytest.mark.parametrize(("text", "said"), [
     ("[finger3]\nlink_m = 0.14\n", "nobody reads finger3"),
     ("[finger1]\nlinks = 0.14\n", "unexpected keyword argument 'links'"),
-    ("[finger1]\nlink_m = -1.0\n", "link_m is -1.0"),
-    ("[finger1]\nfriction_by_load = [[1.0, 1.0], [0.5, 2.0]]\n", "want forces that rise"),
+    ("[finger1]\nlink_m = -1.0\n", "finger1: .*link_m is -1"),
+    ("[finger2]\nlink_m = 'x'\n", "finger2: "),
+    ("[finger1]\nturned_rad = nan\n", "turned_rad is nan; want an angle within pi"),
+    ("[finger1]\nturned_rad = 'x'\n", "finger1: could not convert"),
+    ("[finger1]\nfriction_by_load = [[1.0, 1.0], [0.5, 2.0]]\n", "that rise"),
     ("[finger1]\nfriction_by_load = [[1.0, -1.0]]\n", "a factor of 0 or more"),
 ])  # fmt: skip
 def test_what_a_simulated_hand_hides_is_checked(tmp_path: Path, text: str, said: str) -> None:
@@ -138,3 +141,9 @@ def test_records_that_are_too_few_are_told_by_what_is_missing() -> None:
     assert survey.missing(21, 7) == "9 more rows and 3 more grasps"
     assert survey.missing(29, 12) == "1 more row" and survey.missing(36, 9) == "1 more grasp"
     assert survey.missing(survey.LEAST_ROWS, survey.LEAST_GRASPS) == ""
+
+
+@pytest.mark.parametrize("loads", [(), (0.0, 1.0), (-0.5,), (0.5, 50.0), (math.nan,), (math.inf,)])
+def test_forces_that_no_finger_bears_are_refused_before_anything_moves(loads: tuple[float, ...]) -> None:
+    with pytest.raises(ValueError, match=r"above 0 and below .* N, an overload"):
+        settings(3, loads)
