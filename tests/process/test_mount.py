@@ -112,7 +112,13 @@ def test_a_number_that_a_block_cuts_is_one_number(files: Path, axis: sioms.AxisN
     with open(files / "mod0" / "xaxis", "wb", buffering=0) as file:
         file.write(b"0.1\n" * 127 + b"0.05")
     wait_for(lambda: "its last line has no end" in (files / ".log").read_text(), "what was left out is told")
-    assert "0x5401" not in (files / ".log").read_text(), "who asks whether this is a terminal is no news"
+    with open(files / "mod0" / "xaxis", "rb", buffering=0) as file:
+        for number in (0x5401, ord("S") << 8 | 99):
+            with raises(errno.ENOTTY):
+                fcntl.ioctl(file, number)
+    log = (files / ".log").read_text()
+    assert "0x5401" not in log, "who asks whether this is a terminal is no news"
+    assert "request 0x5363; want" in log
     assert axis.read().position[0] == pytest.approx(0.1, abs=1e-3)
 
 

@@ -52,7 +52,9 @@ def served(function: Callable[..., Any]) -> Callable[..., Any]:
             return function(self, path, *arguments)
         except OSError as error:
             # Shells and completion look for files all the time, and who opens a file asks whether it is a terminal.
-            if (function.__name__, error.errno) not in (("getattr", errno.ENOENT), ("ioctl", errno.ENOTTY)):
+            is_look = function.__name__ == "getattr" and error.errno == errno.ENOENT
+            is_of_others = function.__name__ == "ioctl" and arguments[0] >> 8 & 0xFF != MAGIC
+            if not (is_look or is_of_others):
                 self._note(path, error)
             code = error.errno if error.errno and error.errno > 0 else errno.EIO
             raise OSError(code, error.strerror) from None
