@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import time
 from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -77,6 +78,20 @@ def test_a_session_without_a_request_stops_and_a_later_request_is_heard(rig: Rig
     assert rig.noted == ["eva: enough"]
     rig.request.request(2000, PID, "again")
     assert f"pid {PID}: again" in rig.stops.hear_request()
+
+
+@pytest.mark.parametrize("is_honest", [True, False])
+def test_a_stop_past_the_daemon_was_asked_for_when_it_was_written(rig: Rig, is_honest: bool) -> None:
+    """As its word says; a word that the time of the file's last change contradicts counts for nothing."""
+    written_ns = time.monotonic_ns()
+    rig.request.request(written_ns if is_honest else written_ns - 10**9, PID, "enough")
+    rig.latch.stop(written_ns + 1, rig.request.source)  # by a driver
+    sent_ns = time.monotonic_ns()
+    rig.stops.hear_request()
+    assert rig.stops.stopped_since(written_ns - 1, 1)
+    assert rig.stops.stopped_since(sent_ns, 1) is not is_honest
+    time.sleep(0.011)
+    assert not rig.stops.stopped_since(time.monotonic_ns(), 1)
 
 
 class Device:
