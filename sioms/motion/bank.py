@@ -263,13 +263,17 @@ class Bank(ABC):
         self._catch_up(now_ns)
         self._abandon(fresh, now_ns, errno.ECANCELED, "emergency stop", fastest=True)
 
-    def fault(self, axes: AxesLike, text: str, now_ns: int | None = None) -> None:
-        """Put axes in fault: buffers dropped, stopped the fastest way there is; latched until reset()."""
+    def fault(self, axes: AxesLike, text: str, now_ns: int | None = None, *, lets_go: bool = True) -> None:
+        """Put axes in fault: buffers dropped, stopped the fastest way there is; latched until reset().
+
+        Servos whose loop the host closes are let go, unless it is known that their loop is not what is wrong.
+        """
         chosen = np.asarray(axes, dtype=np.int64)
         stamp = self._last_ns if now_ns is None else now_ns
         self._queue.latch_fault(chosen, text, stamp)
         self._abandon(chosen, stamp, errno.EIO, text, fastest=True)
-        self._let_go(chosen)
+        if lets_go:
+            self._let_go(chosen)
 
     def let_go(self, axes: AxesLike) -> None:
         """Press no more with these axes, however far from their set-points; reset() has them hold where they are."""

@@ -393,9 +393,14 @@ class AxisBank(Bank):
 
     def _look(self, now_ns: int) -> None:
         """Put axes in fault that move as nobody has told them."""
-        for finding in self._motion_watch.look(now_ns):
-            if not self._queue.latched[finding.axis] & (LOST if finding.lost else FAULT):
-                (self.lose_place if finding.lost else self.fault)([finding.axis], finding.text, now_ns)
+        for axis, text, lost, drifts in self._motion_watch.look(now_ns):
+            if self._queue.latched[axis] & (LOST if lost else FAULT):
+                if not drifts:  # it was held, which was no help
+                    self.let_go([axis])
+            elif lost:
+                self.lose_place([axis], text, now_ns)
+            else:
+                self.fault([axis], text, now_ns, lets_go=not (drifts and self._law.tuned[axis]))
 
     def _first_measurement(self, told: NDArray[np.float64], now_ns: int) -> None:
         self._seen = True
@@ -461,14 +466,19 @@ class AxisBank(Bank):
             self._keep(self.keeper, now_ns)
 
     def _lose(self, axes: Axes, now_ns: int) -> None:
-        """Fault axes whose following error is too great; a stepper that does so has stalled."""
-        bits = int(AxisStatus.FOLLOWING_ERROR)
-        for axis in axes[(self._queue.latched[axes] & bits) == 0].tolist():
+        """Fault axes whose following error is too great; a stepper that does so has stalled.
+
+        One that gains of a command had lag behind is braked and held by its own.
+        """
+        bits, tuned = int(AxisStatus.FOLLOWING_ERROR), self._law.tuned.copy()
+        fresh = (self._queue.latched[axes] & bits) == 0
+        self.let_go(axes[~fresh])  # they were held, which was no help
+        for axis in axes[fresh].tolist():
             self._queue.latched[axis] |= bits | (int(AxisStatus.STALLED) if self.stepper[axis] else 0)
             unit = self.settings[axis].unit
             text = f"following error {self._following[axis]:g} {unit}; at most {self._error_max[axis]:g} {unit}"
-            self.fault([axis], text, now_ns)
-            if not self.stepper[axis]:
+            self.fault([axis], text, now_ns, lets_go=not tuned[axis])
+            if self._limp[axis]:
                 self._actuator[axis] = self._force[axis] = self._law.output[axis] = 0.0
 
     def _keep_switches(self, switches: NDArray[np.int64], now_ns: int) -> None:

@@ -148,4 +148,4 @@ class HostWatch:
             text = away_text(one, speed, float(self._commanded[axis]))
         else:
             text = uncommanded_text(one, float(self._reference[axis]), float(self._raw[axis]), speed)
-        return Finding(axis, text, lost=False)
+        return Finding(axis, text, lost=False, drifts=not odd & (TOO_FAST | AWAY))

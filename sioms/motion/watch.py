@@ -80,11 +80,13 @@ class Finding(NamedTuple):
         axis: bank axis.
         text: what, with numbers and units.
         lost: its place is no longer known.
+        drifts: it moves though nothing is commanded, no faster than it may.
     """
 
     axis: int
     text: str
     lost: bool
+    drifts: bool = False
 
 
 @dataclass(slots=True)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sioms.motion import AxisKind, Homing
+from sioms.motion import AxisKind, CommandError, Homing
 from sioms.motion.settings import SWITCH_HOME, Watch
 from sioms.protocol.flags import AxisStatus, ControlMode
 
@@ -224,6 +224,51 @@ def test_a_narrowed_acceleration_does_not_lengthen_the_end_of_a_force(stop: str)
     rig.tick(2000)
     assert abs(plant.velocity) < 0.01 * 2.0  # an emergency stop lets go at this speed
     assert plant.position - place < speed**2 / 10 + 0.1 * speed + 0.01
+
+
+@pytest.mark.parametrize("pull", (0.0, -2.0))
+def test_an_axis_that_gains_of_a_command_had_lag_behind_is_braked_for_the_fault(pull: float) -> None:
+    plant = Mass(viscous=0.2)
+    rig = rig_of(plant, following_error_max=0.1)
+    rig.write(mode=VELOCITY, velocity=0.5)
+    rig.tick(400)
+    plant.pull = pull
+    rig.write(mode=VELOCITY | GAINS, velocity=0.7, k=0.0, replace=True)
+    while not int(rig.field("status")) & AxisStatus.FOLLOWING_ERROR:
+        rig.tick()
+    place, speed = plant.position, abs(plant.velocity)
+    rig.tick(2000)
+    assert abs(plant.velocity) < 1e-3
+    assert abs(plant.position - place) < speed**2 / 10 + 0.1 * speed + 0.02
+    with pytest.raises(CommandError, match="fault"):
+        rig.write(mode=POSITION, position=0.0)
+
+
+def test_an_axis_that_sinks_for_gains_of_a_command_is_held_in_fault() -> None:
+    plant = Mass(viscous=0.0, pull=-2.0)
+    rig = rig_of(plant, watch=Watch())
+    rig.write(mode=POSITION, position=0.5)
+    rig.run()
+    rig.tick(500)
+    rig.write(mode=POSITION | GAINS, position=0.5, k=0.0)
+    rig.tick(2000)
+    assert int(rig.field("status")) & AxisStatus.FAULT
+    assert abs(plant.velocity) < 1e-3
+    assert plant.position > 0.3
+
+
+def test_a_loop_that_its_configured_gains_do_not_close_is_let_go() -> None:
+    """Its motor has come off: what a command has set was not what was wrong."""
+    plant = Mass(viscous=1.0)
+    motor = [1.0]
+    rig = Rig([axis(**{**CONFIGURED, "following_error_max": 0.1})], plant=lambda force, dt: plant(force * motor[0], dt))
+    rig.write(mode=VELOCITY | GAINS, velocity=0.5, k=200.0, kz=0.0, kp=0.0, kb=-40.0)
+    rig.tick(400)
+    motor[0] = -1.0
+    rig.tick(1500)
+    assert int(rig.field("status")) & AxisStatus.FAULT
+    assert rig.field("force") == 0.0
+    assert np.abs(rig.trace("velocity")).max() < 2.0
 
 
 def test_what_commands_have_set_ends_with_their_client() -> None:
