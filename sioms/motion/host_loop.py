@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from . import axis_step
-from .axis_step import FORCE, HOLD, SETTLING, STOP
+from .axis_step import FORCE, HOLD, SETTLING, STOP, Loop
 from .bank import Axes, Bank
 from .commands import Command
 from .guard import LimitGuard
@@ -70,15 +70,13 @@ class AxisBank(Bank):
         super().__init__(settings, markers, capacity, passing=True)
         n = self.n
         store = PlanStore(n)
-        queue, rows, limits = self._queue, self.rows, self._queue.limits
+        queue, limits = self._queue, self._queue.limits
         self._law = ControlLaw(
-            settings, tick_s, raw=self._raw, offset=self._offset, position=self._position, velocity=self._velocity,
-            present=store.present, segment_ns=store.segment_ns,
+            settings, tick_s, raw=self._raw, offset=self._offset, present=store.present, segment_ns=store.segment_ns,
             minimum=limits.minimum, maximum=limits.maximum, deceleration=limits.acceleration,
-            k=rows["k"], kz=rows["kz"], kp=rows["kp"], kb=rows["kb"], desired=self._desired,
-            desired_velocity=self._desired_velocity, following=self._following, force=self._force,
-            status=self._status, buffered=self._buffered, latched=queue.latched, waiting=queue.waiting,
-            has_head=queue.has_head,
+            desired=self._desired, desired_velocity=self._desired_velocity, following=self._following,
+            latched=queue.latched, waiting=queue.waiting, has_head=queue.has_head,
+            **{column: row for column, row in self.rows.items() if column in Loop.kinds},
         )  # fmt: skip
         self.loop = self._law.loop
         self.loop.late_ns = self._late_ns = int(late_max_s * 1e9)

@@ -26,6 +26,14 @@ def test_fields_are_one_block_and_integers_are_int64():
     assert rig.field("status") & S.MOVING
 
 
+def test_a_field_of_the_loop_with_the_name_of_a_column_is_that_column():
+    """A column that every tick works out anew is declared, and filled in the steps; nothing between hands it on."""
+    bank = Rig([axis(), axis()]).bank
+    shared = [name for name in bank.rows if name in bank.arrays]
+    assert {"position", "velocity", "force", "k", "kz", "kp", "kb", "status", "buffered"} <= set(shared)
+    assert all(np.shares_memory(bank.arrays[name], bank.rows[name]) for name in shared)
+
+
 def test_velocity_lasts_until_the_next_command_which_starts_without_a_jump():
     rig = Rig([axis()])
     rig.write(mode=MODE.VELOCITY, velocity=0.5)
