@@ -174,7 +174,7 @@ def table(answers: Sequence[Answer]) -> str:
         ("error with its reason", sum(a.outcome == ERROR for a in answers)),
         ("refused, nothing named", sum(not a.names for a in refused)),
         ("refused beside a name for a part", sum(bool(a.names) for a in refused)),
-        ("the damaged record left out, the rest right", sum(a.left_out for a in answers)),
+        ("damaged records left out, the rest told", sum(a.left_out for a in answers)),
         ("a name", sum(a.outcome in ("named", "ambiguous") and not a.left_out for a in answers)),
         ("nothing is missing", sum(a.outcome == "none" and not a.left_out for a in answers)),
         ("traceback", sum(a.outcome == TRACEBACK for a in answers)),
