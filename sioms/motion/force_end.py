@@ -101,13 +101,15 @@ class ForceEnds:
             now_ns: instant of the tick.
         """
         bounded = self._direction != 0.0
-        self._since_ns[bounded & (self._since_ns == 0)] = now_ns
-        self._ahead_ns[~bounded | (velocity * self._direction > -REST * limit)] = now_ns
+        fresh = bounded & (self._since_ns == 0)
+        self._since_ns[fresh] = now_ns
+        self._ahead_ns[~bounded | fresh | (velocity * self._direction > -REST * limit)] = now_ns
         moves = bounded & ((np.abs(velocity) > REST * limit) | (self._moved_ns == 0))
         self._moved_ns[moves] = now_ns
-        over = bounded & ((now_ns - self._since_ns > LONGEST_NS) | (now_ns - self._ahead_ns > BACK_NS))
-        yields = np.flatnonzero(self._presses & bounded | over)
-        rested = np.flatnonzero(over | bounded & (now_ns - self._moved_ns > REST_NS))
+        back = now_ns - self._ahead_ns > BACK_NS
+        yields = np.flatnonzero(bounded & (self._presses | back))
+        back |= (now_ns - self._since_ns > LONGEST_NS) | (now_ns - self._moved_ns > REST_NS)
+        rested = np.flatnonzero(bounded & back)
         if rested.size:
             self.end(rested)
         return yields

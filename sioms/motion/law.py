@@ -152,11 +152,45 @@ class ControlLaw:
         self.any_braced = bool(self._braced.any())
         self._limit_force(axes)
 
-    def recall(self, axes: NDArray[np.int64]) -> None:
-        """Put in force again what commands have set: one begins."""
-        braced = axes[self._braced[axes]]
-        if braced.size:
-            self._put(braced, self._commanded[:, braced])
+    def recall(self, axes: NDArray[np.int64], places: Vector) -> None:
+        """Put in force again what commands have set: one begins on each of these axes, at its place (m,)."""
+        braced = self._braced[axes]
+        if braced.any():
+            chosen = axes[braced]
+            self._error[chosen] = places[braced] - self.actual(chosen)[0]
+            self._put(chosen, self._commanded[:, chosen])
+
+    def is_braced(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell on which axes what is configured is in force until a command begins (m,)."""
+        braced: NDArray[np.bool_] = self._braced[axes]
+        return braced
+
+    def recalled(
+        self, axis: int, place: float, gains: tuple[float, float, float, float] | None, offset: float | None
+    ) -> float:
+        """Return the set-point at which a braced servo goes on with its force, by gains that come into force.
+
+        A motion is not force to be kept: then the set-point comes no farther from the axis than it is.
+
+        Args:
+            axis: which.
+            place: its set-point [unit].
+            gains: k, kz, kp, kb of a command; None: those of commands before it.
+            offset: force_offset of the command; None: that of before.
+        """
+        if self.stepper[axis] or self.limp[axis]:
+            return place
+        k, kz, kp, kb = self._commanded[:FORCE_ROW, axis].tolist() if gains is None else gains
+        at, velocity, lead = self._position.item(axis), self._velocity.item(axis), place - self._position.item(axis)
+        gain, output = k * (1.0 + kz), self.output.item(axis)
+        if gain > 0.0:
+            carried = (self.offset.item(axis) if offset is None else offset) + self._integral.item(axis)
+            keeps = (output * (1.0 + kp) - carried - kb * velocity) / gain
+        else:
+            keeps = 0.0
+        if abs(velocity) > REST * self.velocity_limit[axis]:
+            keeps = min(max(keeps, min(lead, 0.0)), max(lead, 0.0))
+        return at + keeps
 
     def forget(self, axes: NDArray[np.int64]) -> None:
         """Commands have set nothing on these axes, which have been halted."""

@@ -14,7 +14,7 @@ from .arrival import Approach, plan_point
 from .axis_step import FORCE, POSITION, RATE
 from .commands import Command, is_point_move
 from .law import ControlLaw
-from .profile import Bounds, Plan, Planner, State, plan_force
+from .profile import Bounds, InfeasibleError, Plan, Planner, State, plan_force
 from .queue import CommandQueue
 from .settings import AxisSettings
 from .store import PlanStore
@@ -90,6 +90,20 @@ class Planning:
         command = command._replace(control_mode=modes.VELOCITY, velocity=velocity)
         bounds = self._bounds(axis, command)._replace(minimum=-math.inf, maximum=math.inf)
         return self._planner.plan(command, state, bounds)
+
+    def recalled(self, axis: int, command: Command, state: State) -> float:
+        """Return where a command begins on an axis that the configured gains have held in this state."""
+        place, v, a = state
+        mode, low, high = command.control_mode, self._limits.minimum.item(axis), self._limits.maximum.item(axis)
+        gains = (command.k, command.kz, command.kp, command.kb) if mode & modes.GAINS else None
+        offset = command.force_offset if mode & modes.FORCE_OFFSET else None
+        begins = self._law.recalled(axis, place, gains, offset)
+        begins = min(max(begins, min(place, low)), max(place, high))
+        try:
+            self.planned(axis, command, (begins, v, a), False)
+        except InfeasibleError:  # it has been acknowledged for where the set-point was
+            return place
+        return begins
 
     def put_in_force(self, axis: int, command: Command | None) -> None:
         """Put the gains, offset and limits that a command specifies in force; they stay."""

@@ -271,8 +271,8 @@ class Sequencer:
         law = self._law
         state, behind, pressing = self.state(axes, seen_ns), law.is_behind(axes), self.kind[axes] == FORCE
         most, tuned = self._limits.acceleration[axes], law.tuned[axes]
-        measured = tuned | pressing  # no profile has made their velocities
-        if measured.any():
+        if tuned.any() or pressing.any():
+            measured = (tuned | pressing) & ~law.stepper[axes]  # no profile has made their velocities
             most[measured] = self._hardest[axes[measured]]
             state[tuned, 1] = law.actual(axes[tuned])[1]
             state[tuned, 0] = law.brace(axes)[tuned]
@@ -318,7 +318,10 @@ class Sequencer:
         self._run_now(one, RATE, now_ns)
 
     def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
-        self._law.brace(axes)  # what no command has asked for is done by the gains that are configured
+        tuned = axes[self._law.tuned[axes]]
+        if tuned.size:  # what no command has asked for is done by the gains that are configured
+            self._law.brace(tuned)
+            self._law.give_way(tuned)
         self._set_kind(axes, kind)
         self.stopped[axes] = kind == STOP
         self._row_taken[self.store.row[axes]] = False
@@ -384,8 +387,9 @@ class Sequencer:
         short = store.duration[rows] * PIECES < self._tick_s
         if short.any():
             self._hold_back(axes, state, short, free)
+        begins = self._recalled(axes, state, free) if self._law.any_braced else state
         for i in np.flatnonzero(free & ~self._ready[axes]).tolist():
-            p, v, a = state[i].tolist()
+            p, v, a = begins[i].tolist()
             self._plan_head(int(axes[i]), (p, v, a), now_ns)
         go = free & self._ready[axes]
         if go.all():
@@ -395,6 +399,18 @@ class Sequencer:
                 self._start(axes[go], start_ns[go], fraction[go], now_ns)
             rest = ~go
             self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
+
+    def _recalled(self, axes: Axes, state: Floats, free: NDArray[np.bool_]) -> Floats:
+        """Return the states in which commands begin, of braced axes those in which the gains to come keep the force."""
+        state = state.copy()
+        for i in np.flatnonzero(free & self._law.is_braced(axes)).tolist():
+            axis = int(axes[i])
+            command = self._queue.heads[axis]
+            if command is not None and not command.control_mode & modes.ANY_FORCE:
+                p, v, a = state[i].tolist()
+                state[i, 0] = self.planning.recalled(axis, command, (p, v, a))
+                self._ready[axis] = False
+        return state
 
     def _hold_back(self, axes: Axes, state: Floats, short: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
         """Count what follows short commands; take out of ``free`` the axes that have had their share of this tick."""
@@ -465,7 +481,7 @@ class Sequencer:
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
         if self._law.any_braced:
-            self._law.recall(axes)
+            self._law.recall(axes, store.state(axes, now_ns)[:, 0])
         self.kind[axes] = self._row_kind[rows]
         pressing = axes[self.kind[axes] == FORCE]
         if pressing.size:
@@ -484,7 +500,9 @@ class Sequencer:
 
     def _rest(self, axes: Axes, state: Floats, start_ns: NDArray[np.int64], fraction: Floats, now_ns: int) -> None:
         """Nothing follows: hold the axes at rest, brake the others."""
-        store = self.store
+        store, pressed = self.store, self.kind[axes] == FORCE
+        if pressed.any():  # nothing that a command has set for a force need brake the axis
+            self._law.brace(axes[pressed])
         still = np.abs(state[:, 1]) <= STILL
         chosen = axes[still]
         if chosen.size:
@@ -496,7 +514,7 @@ class Sequencer:
             self._queue.emit(EventKind.IDLE, came[self.is_idle(came)], now_ns)
         chosen = axes[~still]
         if chosen.size:
-            deceleration = self._limits.acceleration[chosen]
+            deceleration = np.where(pressed, self._hardest[axes], self._limits.acceleration[axes])[~still]
             store.put_brake(store.row[chosen], state[~still, 0], state[~still, 1], deceleration)
             self._set_kind(chosen, BRAKE)
             self._ready[chosen] = False  # what was planned ahead would begin in motion

@@ -52,7 +52,7 @@ class ShortWay:
         if len(commands) > FEW or not sequencer.is_plain:
             return False
         axes = sorted({command.axis for command in commands})
-        if len(axes) < len(commands):
+        if len(axes) < len(commands) or (self._law.any_braced and self._law.is_braced(np.array(axes)).any()):
             return False
         planned = []
         try:
@@ -67,8 +67,6 @@ class ShortWay:
         except InfeasibleError:
             return False
         ended = []
-        if self._law.any_braced:
-            self._law.recall(np.array(axes))
         for command, each in zip(commands, planned, strict=True):
             axis = command.axis
             queue.end_with(command)

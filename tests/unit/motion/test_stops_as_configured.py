@@ -10,13 +10,15 @@ import pytest
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
 
-from sioms.motion import AxisKind, CommandError, Homing
+from sioms.motion import AxisKind, CommandError, EventKind, Homing
+from sioms.motion.force_end import BACK_NS, ForceEnds
 from sioms.motion.settings import SWITCH_HOME, Watch
 from sioms.protocol.flags import AxisStatus, ControlMode
 
 from ...motion_rig import Rig, axis
 from .test_behind import Mass
 
+TIME = ControlMode.SPECIFIED_TIME
 POSITION, VELOCITY, FORCE = ControlMode.POSITION, ControlMode.VELOCITY, ControlMode.FORCE
 GAINS, MAX_FORCE = ControlMode.SPECIFIED_GAINS, ControlMode.SPECIFIED_MAX_FORCE
 CONFIGURED = {"k": 400.0, "kb": -40.0, "following_error_max": np.inf, "acceleration_max": 5.0, "jerk_max": None,
@@ -170,6 +172,100 @@ def test_a_load_that_the_allowed_force_does_not_carry_is_held(most: float, pull:
     rig.tick(1000)
     assert abs(plant.velocity) < 1e-3
     assert abs(plant.position - place) < 1e-3
+
+
+def test_a_long_brake_of_an_axis_that_is_held_back_goes_on_to_its_end() -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant, acceleration_max=0.5, position_min=None, position_max=None)
+    rig.write(mode=VELOCITY, velocity=1.5)
+    rig.tick(3500)
+    rig.write(mode=VELOCITY | MAX_FORCE, velocity=1.5, max_force=5.0, replace=True)
+    rig.tick(20)
+    place, before = plant.position, len(rig.history)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(5000)
+    assert plant.position - place == pytest.approx(1.5**2 / (2 * 0.5) + 1.5 * 40 / 400, abs=0.05)
+    assert np.abs(rig.trace("force")[before:]).max() < 1.0  # of 1 kg that is braked with 0.5 m/s^2
+
+
+@pytest.mark.parametrize("after", ({}, {"k": 3000.0, "kb": -90.0}, {"k": 20.0, "kb": -20.0}), ids=str)
+@pytest.mark.parametrize("gains", ({"k": 4000.0, "kb": -100.0}, {"k": 20.0, "kb": -20.0}), ids=str)
+def test_the_next_command_does_not_leap_with_what_the_axis_carries(
+    gains: dict[str, float], after: dict[str, float]
+) -> None:
+    plant = Mass(viscous=10.0, pull=-5.0)  # a weight
+    rig = rig_of(plant, force_max=100.0)
+    rig.write(mode=POSITION | GAINS, position=0.1, **gains)
+    rig.tick(6000)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(800)
+    place, before = plant.position, len(rig.history)
+    rig.write(mode=VELOCITY | (GAINS if after else 0), velocity=0.0, **after)
+    rig.tick(800)
+    assert rig.field("k") == {**gains, **after}["k"]
+    assert abs(plant.position - place) < 1e-4
+    assert np.abs(rig.trace("force")[before:] - 5.0).max() < 0.05
+
+
+def test_a_command_that_was_possible_where_the_set_point_was_is_carried_out() -> None:
+    plant = Mass(viscous=10.0, pull=-5.0)
+    rig = rig_of(plant)
+    rig.write(mode=POSITION | GAINS, position=0.1, k=20.0, kb=-20.0)
+    rig.tick(6000)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(800)
+    rig.write(mode=POSITION | TIME, position=rig.field("commanded_position") - 0.2, time=0.4001)  # 2 sqrt(0.2 / 5)
+    rig.tick(800)
+    assert rig.kinds().count(EventKind.STARTED) == 2
+    assert rig.bank.fault_text(0) == ""
+
+
+def test_a_force_that_ends_by_itself_is_braked_whatever_the_gains() -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant)
+    rig.write(mode=FORCE | TIME | GAINS, force=1.0, time=0.3, k=0.0)
+    rig.tick(290)
+    speed, place = plant.velocity, plant.position
+    rig.tick(600)
+    assert abs(plant.velocity) < 1e-3
+    assert plant.position - place < speed**2 / 10 + 0.1 * speed + 0.01
+
+
+def test_a_tuned_axis_that_was_let_go_is_held_without_a_kick() -> None:
+    peaks = []
+    for mode in (POSITION, POSITION | MAX_FORCE):
+        plant = Mass(viscous=50.0, pull=-5.0)
+        rig = rig_of(plant, k=825043.0, kz=-0.914, kb=0.0, force_max=100.0, force_offset=5.0)
+        rig.write(mode=mode, position=0.1, max_force=50.0)
+        rig.run()
+        rig.tick(200)
+        rig.bank.let_go(rig.axes)
+        rig.tick(3)
+        rig.bank.reset(rig.axes)
+        rig.tick(600)
+        peaks.append(np.abs(rig.trace("force")[-600:]).max())
+    assert peaks[1] == pytest.approx(peaks[0])
+
+
+def test_a_stepper_with_narrowed_acceleration_does_not_swing_back() -> None:
+    rig = Rig([axis(kind=AxisKind.STEPPER, k=None)], plant=lambda output, dt: output.copy())
+    rig.bank.set_limits(rig.axes, acceleration_max=0.5)
+    rig.write(mode=VELOCITY, velocity=0.5)
+    rig.tick(2000)
+    rig.write(mode=VELOCITY | GAINS, velocity=0.5, replace=True, k=900.0)
+    rig.tick(50)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(4000)
+    assert rig.field("position") >= rig.trace("position").max() - 1e-6
+
+
+def test_an_axis_that_turns_at_once_is_held_back_as_long_as_others() -> None:
+    ends, limit = ForceEnds(1), np.array([1.0])
+    ends.hold_back(0, 1.0, 0.5)
+    ends.look(np.array([-0.2]), limit, 10**12)
+    assert ends.is_bound(np.array([0])).all()
+    ends.look(np.array([-0.2]), limit, 10**12 + BACK_NS + 1)
+    assert not ends.is_bound(np.array([0])).any()
 
 
 @pytest.mark.parametrize(
