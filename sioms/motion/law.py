@@ -16,6 +16,7 @@ from .settings import AxisKind, AxisSettings
 from .store import NEVER_NS
 
 Vector = NDArray[np.float64]
+Gains = tuple[float, float, float, float]
 FORCE_ROW = 4
 """Of what commands may set: the gains k, kz, kp, kb, and the greatest force."""
 FOLLOWS_S = 0.5
@@ -132,7 +133,7 @@ class ControlLaw:
         """Put the greatest force of a command in force [N or N*m]."""
         self._command(np.array([axis]), FORCE_ROW, most)
 
-    def command_gains(self, axis: int, gains: tuple[float, float, float, float]) -> None:
+    def command_gains(self, axis: int, gains: Gains) -> None:
         """Put the gains k, kz, kp, kb of a command in force."""
         self._command(np.array([axis]), slice(FORCE_ROW), np.array(gains)[:, None])
 
@@ -152,12 +153,12 @@ class ControlLaw:
         self.any_braced = bool(self._braced.any())
         self._limit_force(axes)
 
-    def recall(self, axes: NDArray[np.int64], places: Vector) -> None:
-        """Put in force again what commands have set: one begins on each of these axes, at its place (m,)."""
+    def recall(self, axes: NDArray[np.int64], places: Vector, now_ns: int) -> None:
+        """Put in force again what commands have set: one begins now on each of these axes, at its place (m,)."""
         braced = self._braced[axes]
         if braced.any():
             chosen = axes[braced]
-            self._error[chosen] = places[braced] - self.actual(chosen)[0]
+            self._error[chosen] = places[braced] - self.actual(chosen, now_ns)[0]
             self._put(chosen, self._commanded[:, chosen])
 
     def is_braced(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -165,9 +166,7 @@ class ControlLaw:
         braced: NDArray[np.bool_] = self._braced[axes]
         return braced
 
-    def recalled(
-        self, axis: int, place: float, gains: tuple[float, float, float, float] | None, offset: float | None
-    ) -> float:
+    def recalled(self, axis: int, place: float, now_ns: int, gains: Gains | None, offset: float | None) -> float:
         """Return the set-point at which a braced servo goes on with its force, by gains that come into force.
 
         A motion is not force to be kept: then the set-point comes no farther from the axis than it is.
@@ -175,13 +174,16 @@ class ControlLaw:
         Args:
             axis: which.
             place: its set-point [unit].
+            now_ns: when [ns].
             gains: k, kz, kp, kb of a command; None: those of commands before it.
             offset: force_offset of the command; None: that of before.
         """
         if self.stepper[axis] or self.limp[axis]:
             return place
         k, kz, kp, kb = self._commanded[:FORCE_ROW, axis].tolist() if gains is None else gains
-        at, velocity, lead = self._position.item(axis), self._velocity.item(axis), place - self._position.item(axis)
+        velocity = self._velocity.item(axis)
+        at = self._position.item(axis) + velocity * self._since_tick(now_ns)
+        lead = place - at
         gain, output = k * (1.0 + kz), self.output.item(axis)
         if gain > 0.0:
             carried = (self.offset.item(axis) if offset is None else offset) + self._integral.item(axis)
@@ -197,14 +199,14 @@ class ControlLaw:
         self._commanded[:, axes] = self._configured[:, axes]
         self._put(axes, self._configured[:, axes])
 
-    def brace(self, axes: NDArray[np.int64]) -> Vector:
+    def brace(self, axes: NDArray[np.int64], now_ns: int) -> Vector:
         """Put what is configured in force, until a command begins; return where the axes are to be held or braked from.
 
         That is where a servo is, and as far beside it as has the law go on with the force that it has put out; but for
         force that drives an axis on. In the direction of its motion, or of the force when it stands, it presses no
         harder than it was allowed before, until it has come to rest.
         """
-        position, velocity = self.actual(axes)
+        position, velocity = self.actual(axes, now_ns)
         tuned = self.tuned[axes]
         if not tuned.any():
             return position
@@ -239,11 +241,19 @@ class ControlLaw:
         told = self._told_error[axes]
         self._error_max[axes] = np.where(np.isnan(told), usual, told)
 
-    def actual(self, axes: NDArray[np.int64]) -> tuple[Vector, Vector]:
-        """Return where axes are and how fast they go: measured of servos, put out of steppers (m,) each."""
+    def actual(self, axes: NDArray[np.int64], now_ns: int = 0) -> tuple[Vector, Vector]:
+        """Return where axes are and how fast they go: measured of servos, put out of steppers (m,) each.
+
+        That was so in the last tick; at now_ns, if that is later, they have gone on at their velocity.
+        """
         stepper = self.stepper[axes]
         position = np.where(stepper, self.slewed[axes], self._position[axes])
-        return position, np.where(stepper, self.output[axes], self._velocity[axes])
+        velocity = np.where(stepper, self.output[axes], self._velocity[axes])
+        return position + velocity * self._since_tick(now_ns), velocity
+
+    def _since_tick(self, now_ns: int) -> float:
+        """Return how long the last tick is past at now_ns [s]; its readings may have come with none yet done."""
+        return max(0, now_ns - max(self.loop.last_ns, self.loop.seen_ns)) * 1e-9
 
     def is_on_its_way(self, axes: NDArray[np.int64], rest: Vector) -> NDArray[np.bool_]:
         """Tell which axes (m,) move and are still far from their final setpoints, or have been released."""

@@ -91,13 +91,13 @@ class Planning:
         bounds = self._bounds(axis, command)._replace(minimum=-math.inf, maximum=math.inf)
         return self._planner.plan(command, state, bounds)
 
-    def recalled(self, axis: int, command: Command, state: State) -> float:
-        """Return where a command begins on an axis that the configured gains have held in this state."""
+    def recalled(self, axis: int, command: Command, state: State, now_ns: int) -> float:
+        """Return where a command begins now on an axis that the configured gains have held in this state."""
         place, v, a = state
         mode, low, high = command.control_mode, self._limits.minimum.item(axis), self._limits.maximum.item(axis)
         gains = (command.k, command.kz, command.kp, command.kb) if mode & modes.GAINS else None
         offset = command.force_offset if mode & modes.FORCE_OFFSET else None
-        begins = self._law.recalled(axis, place, gains, offset)
+        begins = self._law.recalled(axis, place, now_ns, gains, offset)
         begins = min(max(begins, min(place, low)), max(place, high))
         try:
             self.planned(axis, command, (begins, v, a), False)

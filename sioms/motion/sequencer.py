@@ -259,7 +259,7 @@ class Sequencer:
             self.stop(moving, now_ns, now_ns)
             self.advance(now_ns)
         if resting.size:
-            self.hold(resting, self._law.brace(resting), now_ns)
+            self.hold(resting, self._law.brace(resting, now_ns), now_ns)
         if waited.size:
             self._queue.emit(EventKind.IDLE, waited[self.is_idle(waited)], now_ns)
         self.refresh(axes)
@@ -275,10 +275,10 @@ class Sequencer:
             measured = (tuned | pressing) & ~law.stepper[axes]  # no profile has made their velocities
             most[measured] = self._hardest[axes[measured]]
             state[tuned, 1] = law.actual(axes[tuned])[1]
-            state[tuned, 0] = law.brace(axes)[tuned]
+            state[tuned, 0] = law.brace(axes, seen_ns)[tuned]
         if behind.any():
             late = axes[behind]
-            state[behind, 0], state[behind, 1] = law.actual(late)
+            state[behind, 0], state[behind, 1] = law.actual(late, seen_ns)
             law.give_way(late)
         self.brake(axes, state, start_ns, most)
 
@@ -312,7 +312,7 @@ class Sequencer:
         one = np.array([axis])
         p, v, a = self.state(one, now_ns)[0].tolist()
         if self._law.tuned[axis]:
-            p, v, a = float(self._law.brace(one)[0]), 0.0, 0.0
+            p, v, a = float(self._law.brace(one, now_ns)[0]), 0.0, 0.0
         self.store.put(int(self.store.row[axis]), self.planning.drive(axis, velocity, (p, v, a)))
         self._law.force_ends.end(one)
         self._run_now(one, RATE, now_ns)
@@ -320,7 +320,7 @@ class Sequencer:
     def _run_now(self, axes: Axes, kind: int, start_ns: int) -> None:
         tuned = axes[self._law.tuned[axes]]
         if tuned.size:  # what no command has asked for is done by the gains that are configured
-            self._law.brace(tuned)
+            self._law.brace(tuned, start_ns)
             self._law.give_way(tuned)
         self._set_kind(axes, kind)
         self.stopped[axes] = kind == STOP
@@ -331,12 +331,12 @@ class Sequencer:
 
     def state(self, axes: Axes, now_ns: int) -> Floats:
         """Return the set-point state (m, 3) at now; of axes in force mode the measured one."""
-        return self._actual_of_force(axes, self.store.state(axes, now_ns))
+        return self._actual_of_force(axes, self.store.state(axes, now_ns), now_ns)
 
-    def _end_state(self, axes: Axes) -> Floats:
+    def _end_state(self, axes: Axes, now_ns: int) -> Floats:
         """Return the state (m, 3) in which what follows the plans that have just ended begins."""
         store, law = self.store, self._law
-        state = self._actual_of_force(axes, store.final[store.row[axes]])
+        state = self._actual_of_force(axes, store.final[store.row[axes]], now_ns)
         broken = np.flatnonzero(store.cut_ns[axes] != UNCUT_NS)
         behind = broken[law.is_behind(axes[broken])] if broken.size else broken
         if behind.size:
@@ -348,11 +348,10 @@ class Sequencer:
             self._ready[late] = False  # what was planned ahead would begin somewhere else
         return state
 
-    def _actual_of_force(self, axes: Axes, state: Floats) -> Floats:
+    def _actual_of_force(self, axes: Axes, state: Floats, now_ns: int) -> Floats:
         if self.any_force:
             force = self.kind[axes] == FORCE
-            state[force, 0] = self._position[axes[force]]
-            state[force, 1] = self._velocity[axes[force]]
+            state[force, 0], state[force, 1] = self._law.actual(axes[force], now_ns)
             state[force, 2] = 0.0
         return state
 
@@ -377,7 +376,7 @@ class Sequencer:
         store, queue = self.store, self._queue
         rows = store.row[axes]
         start_ns, fraction = store.ended_at(axes)
-        state = self._end_state(axes)
+        state = self._end_state(axes, now_ns)
         kind = self._row_kind[rows]
         queue.emit(EventKind.ENDED, axes[(kind >= POSITION) & (kind <= FORCE)], now_ns)
         for row in rows[self._row_signals[rows]].tolist():
@@ -387,7 +386,7 @@ class Sequencer:
         short = store.duration[rows] * PIECES < self._tick_s
         if short.any():
             self._hold_back(axes, state, short, free)
-        begins = self._recalled(axes, state, free) if self._law.any_braced else state
+        begins = self._recalled(axes, state, free, now_ns) if self._law.any_braced else state
         for i in np.flatnonzero(free & ~self._ready[axes]).tolist():
             p, v, a = begins[i].tolist()
             self._plan_head(int(axes[i]), (p, v, a), now_ns)
@@ -400,7 +399,7 @@ class Sequencer:
             rest = ~go
             self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
 
-    def _recalled(self, axes: Axes, state: Floats, free: NDArray[np.bool_]) -> Floats:
+    def _recalled(self, axes: Axes, state: Floats, free: NDArray[np.bool_], now_ns: int) -> Floats:
         """Return the states in which commands begin, of braced axes those in which the gains to come keep the force."""
         state = state.copy()
         for i in np.flatnonzero(free & self._law.is_braced(axes)).tolist():
@@ -408,7 +407,7 @@ class Sequencer:
             command = self._queue.heads[axis]
             if command is not None and not command.control_mode & modes.ANY_FORCE:
                 p, v, a = state[i].tolist()
-                state[i, 0] = self.planning.recalled(axis, command, (p, v, a))
+                state[i, 0] = self.planning.recalled(axis, command, (p, v, a), now_ns)
                 self._ready[axis] = False
         return state
 
@@ -481,7 +480,7 @@ class Sequencer:
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
         if self._law.any_braced:
-            self._law.recall(axes, store.state(axes, now_ns)[:, 0])
+            self._law.recall(axes, store.state(axes, now_ns)[:, 0], now_ns)
         self.kind[axes] = self._row_kind[rows]
         pressing = axes[self.kind[axes] == FORCE]
         if pressing.size:
@@ -502,7 +501,7 @@ class Sequencer:
         """Nothing follows: hold the axes at rest, brake the others."""
         store, pressed = self.store, self.kind[axes] == FORCE
         if pressed.any():  # nothing that a command has set for a force need brake the axis
-            self._law.brace(axes[pressed])
+            self._law.brace(axes[pressed], now_ns)
         still = np.abs(state[:, 1]) <= STILL
         chosen = axes[still]
         if chosen.size:

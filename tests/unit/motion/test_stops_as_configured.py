@@ -268,6 +268,22 @@ def test_an_axis_that_turns_at_once_is_held_back_as_long_as_others() -> None:
     assert not ends.is_bound(np.array([0])).any()
 
 
+@pytest.mark.parametrize("mode", (VELOCITY, VELOCITY | MAX_FORCE, VELOCITY | GAINS, FORCE), ids=str)
+def test_a_stop_between_ticks_is_no_kick(mode: int) -> None:
+    """The readings are those of the last tick, and the axis has gone on since."""
+    peaks = []
+    for since_ns in (0, 500_000, 990_000):
+        plant = Mass(viscous=10.0)
+        rig = rig_of(plant, k=825043.0, kz=-0.914, kb=0.0, force_max=100.0)
+        rig.write(mode=mode, velocity=0.5, force=5.0, max_force=90.0, k=700000.0, kz=-0.9)
+        rig.tick(400)
+        before = len(rig.history)
+        rig.bank.stop(rig.axes, rig.now_ns + since_ns)
+        rig.tick(400)
+        peaks.append(np.abs(rig.trace("force")[before:]).max())
+    assert peaks == pytest.approx([peaks[0]] * 3, abs=2.0)
+
+
 @pytest.mark.parametrize(
     "gains", ({"k": 0.0}, {"k": -500.0}, {"k": 1000.0, "kb": 3.0}, {"k": 900.0, "kp": -0.99}), ids=str
 )
