@@ -105,6 +105,7 @@ class ControlLaw:
         self._error_max: Vector = arrays["error_max"]
         self._error: Vector = arrays["error"]
         self._integral: Vector = arrays["integral"]
+        self._ki: Vector = arrays["ki"]
         self.tuned: NDArray[np.bool_] = arrays["tuned"]
         self._in_force = (self.k, self.kz, self.kp, self.kb, self.force_limit)
         self._configured = np.array(self._in_force)
@@ -153,13 +154,16 @@ class ControlLaw:
         self.any_braced = bool(self._braced.any())
         self._limit_force(axes)
 
-    def recall(self, axes: NDArray[np.int64], places: Vector, now_ns: int) -> None:
-        """Put in force again what commands have set: one begins now on each of these axes, at its place (m,)."""
+    def recall(self, axes: NDArray[np.int64], places: Vector, now_ns: int) -> NDArray[np.int64]:
+        """Put in force again what commands have set: one begins now on each of these axes, at its place (m,); return
+        the axes for which something was.
+        """
         braced = self._braced[axes]
-        if braced.any():
-            chosen = axes[braced]
+        chosen = axes[braced]
+        if chosen.size:
             self._error[chosen] = places[braced] - self.actual(chosen, now_ns)[0]
             self._put(chosen, self._commanded[:, chosen])
+        return chosen
 
     def is_braced(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Tell on which axes what is configured is in force until a command begins (m,)."""
@@ -184,13 +188,13 @@ class ControlLaw:
         velocity = self._velocity.item(axis)
         at = self._position.item(axis) + velocity * self._since_tick(now_ns)
         lead = place - at
-        gain, output = k * (1.0 + kz), self.output.item(axis)
-        if gain > 0.0:
+        gain, output, moves = k * (1.0 + kz), self.output.item(axis), abs(velocity) > REST * self.velocity_limit[axis]
+        if gain > 0.0 and (moves or not self._ki[axis] > 0.0):
             carried = (self.offset.item(axis) if offset is None else offset) + self._integral.item(axis)
             keeps = (output * (1.0 + kp) - carried - kb * velocity) / gain
         else:
             keeps = 0.0
-        if abs(velocity) > REST * self.velocity_limit[axis]:
+        if moves:
             keeps = min(max(keeps, min(lead, 0.0)), max(lead, 0.0))
         return at + keeps
 
@@ -226,10 +230,24 @@ class ControlLaw:
         output = np.where(moves & ((output - offset) * velocity > 0.0), offset, np.clip(output, -limit, limit))
         gain = self.k[chosen] * (1.0 + self.kz[chosen])
         wish = output * (1.0 + self.kp[chosen]) - offset - self.kb[chosen] * velocity
-        lead = np.divide(wish, gain, out=np.zeros(len(chosen)), where=gain > 0.0)
+        carries = self._carries(chosen)
+        self._integral[chosen[carries]] = wish[carries]
+        lead = np.divide(wish, gain, out=np.zeros(len(chosen)), where=(gain > 0.0) & ~carries)
         self._error[chosen] = lead
         position[np.flatnonzero(tuned)[servo]] += lead
         return position
+
+    def _carries(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Tell which axes hold their load by the integral of their error, which would lead them to their set-points."""
+        carries: NDArray[np.bool_] = (self._ki[axes] > 0.0) & ~self.moves(axes) & ~self.stepper[axes]
+        return carries
+
+    def carry_on(self, axes: NDArray[np.int64]) -> None:
+        """Have the integrals of axes at rest, for which a command has begun, go on with the force that holds them."""
+        axes = axes[self._carries(axes) & (self.kind[axes] != FORCE) & ~self.limp[axes]]
+        limit, gain = self.force_limit[axes], self.k[axes] * (1.0 + self.kz[axes])
+        wish = self.output[axes] * (1.0 + self.kp[axes]) - self.offset[axes] - self.kb[axes] * self._velocity[axes]
+        self._integral[axes] = np.clip(wish - gain * self._error[axes], -limit, limit)
 
     def _limit_force(self, axes: NDArray[np.int64]) -> None:
         """Judge how far axes may be behind.

@@ -479,8 +479,9 @@ class Sequencer:
                 self._held.pop(axis, None)
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
+        recalled = axes[:0]
         if self._law.any_braced:
-            self._law.recall(axes, store.state(axes, now_ns)[:, 0], now_ns)
+            recalled = self._law.recall(axes, store.state(axes, now_ns)[:, 0], now_ns)
         self.kind[axes] = self._row_kind[rows]
         pressing = axes[self.kind[axes] == FORCE]
         if pressing.size:
@@ -493,6 +494,8 @@ class Sequencer:
         self._todo.update(dict.fromkeys(axes.tolist()))
         for row in rows[self._row_sets[rows]].tolist():
             self.planning.put_in_force(row // 2, self._row_command[row])
+        if recalled.size:
+            self._law.carry_on(recalled)
         self._queue.emit(EventKind.STARTED, axes, now_ns)
         self._settle_masks()
         self.refresh(axes)

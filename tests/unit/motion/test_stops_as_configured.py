@@ -207,6 +207,22 @@ def test_the_next_command_does_not_leap_with_what_the_axis_carries(
     assert np.abs(rig.trace("force")[before:] - 5.0).max() < 0.05
 
 
+@pytest.mark.parametrize("gains", ({"k": 4000.0, "kb": -100.0}, {"k": 20.0, "kb": -20.0}), ids=str)
+def test_an_integral_carries_on_what_the_axis_held(gains: dict[str, float]) -> None:
+    plant = Mass(viscous=10.0, pull=-5.0)
+    rig = rig_of(plant, k=2000.0, kb=-80.0, ki=300.0, force_max=100.0)
+    rig.tick(3000)
+    rig.write(mode=POSITION | GAINS, position=plant.position, **gains)
+    rig.tick(3000)
+    for after in ({}, {"k": 100.0, "kb": -30.0}):
+        place = plant.position
+        rig.bank.stop(rig.axes, rig.now_ns)
+        rig.tick(1500)
+        rig.write(mode=VELOCITY | (GAINS if after else 0), velocity=0.0, **after)
+        rig.tick(1500)
+        assert abs(plant.position - place) < 1e-3
+
+
 def test_a_command_that_was_possible_where_the_set_point_was_is_carried_out() -> None:
     plant = Mass(viscous=10.0, pull=-5.0)
     rig = rig_of(plant)
