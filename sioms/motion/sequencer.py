@@ -26,7 +26,7 @@ from .law import ControlLaw
 from .plan_step import STILL, Plans
 from .planning import Planned, Planning
 from .profile import InfeasibleError, State
-from .queue import CommandQueue
+from .queue import FAULT, CommandQueue
 from .settings import AxisSettings
 from .store import UNCUT_NS, PlanStore
 from .types import EventKind
@@ -396,7 +396,10 @@ class Sequencer:
         else:
             if go.any():
                 self._start(axes[go], start_ns[go], fraction[go], now_ns)
-            rest = ~go
+            faulty = ~go & self._law.tuned[axes] & ((queue.latched[axes] & FAULT) != 0)
+            if faulty.any():  # what follows was not possible
+                self.stop(axes[faulty], now_ns, now_ns)
+            rest = ~go & ~faulty
             self._rest(axes[rest], state[rest], start_ns[rest], fraction[rest], now_ns)
 
     def _recalled(self, axes: Axes, state: Floats, free: NDArray[np.bool_], now_ns: int) -> Floats:

@@ -247,6 +247,21 @@ def test_a_force_that_ends_by_itself_is_braked_whatever_the_gains() -> None:
     assert plant.position - place < speed**2 / 10 + 0.1 * speed + 0.01
 
 
+def test_an_axis_whose_next_command_is_not_possible_is_braked() -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant)
+    rig.write(mode=VELOCITY, velocity=0.3)
+    rig.tick(500)
+    rig.write(mode=VELOCITY | GAINS, velocity=0.3, replace=True, k=0.0)
+    rig.tick(20)
+    place = plant.position
+    rig.write(mode=POSITION | TIME, position=2.5, time=0.05, replace=True)
+    rig.tick(1000)
+    assert "too short" in rig.bank.fault_text(0)
+    assert abs(plant.velocity) < 1e-3 and rig.bank.is_idle(rig.axes)
+    assert plant.position - place < 0.3**2 / 10 + 0.1 * 0.3 + 0.01
+
+
 def test_a_tuned_axis_that_was_let_go_is_held_without_a_kick() -> None:
     peaks = []
     for mode in (POSITION, POSITION | MAX_FORCE):
