@@ -304,6 +304,10 @@ class ControlLaw:
             np.divide(force, gain, out=error, where=(gain > 0.0) & ~self.stepper[axes])
         return error
 
+    def come_nearer(self, axes: NDArray[np.int64], by: Vector) -> None:
+        """Note by how much set-points have been put nearer to their axes: that is no motion."""
+        self._error[axes] -= by
+
     def give_way(self, axes: NDArray[np.int64]) -> None:
         """Forget the error of axes whose set-point has yielded: what it was before must not push back."""
         self._error[axes] = self._integral[axes] = 0.0

@@ -276,11 +276,23 @@ class Sequencer:
             most[measured] = self._hardest[axes[measured]]
             state[tuned, 1] = law.actual(axes[tuned])[1]
             state[tuned, 0] = law.brace(axes, seen_ns)[tuned]
+            state[tuned, 0] -= self._beyond(axes[tuned], state[tuned], most[tuned], seen_ns)
         if behind.any():
             late = axes[behind]
             state[behind, 0], state[behind, 1] = law.actual(late, seen_ns)
             law.give_way(late)
         self.brake(axes, state, start_ns, most)
+
+    def _beyond(self, axes: Axes, state: Floats, most: Floats, now_ns: int) -> Floats:
+        """Return how far set-points of servos that brake from state would come to rest beyond their soft limits, or
+        farther beyond than the axes are (m,); their errors are less by that.
+        """
+        at, limits = self._law.actual(axes, now_ns)[0], self._limits
+        stand = state[:, 0] + state[:, 1] * np.abs(state[:, 1]) / (2.0 * most)
+        kept = np.clip(stand, np.minimum(limits.minimum[axes], at), np.maximum(limits.maximum[axes], at))
+        beyond: Floats = np.where(self._law.stepper[axes], 0.0, stand - kept)
+        self._law.come_nearer(axes, beyond)
+        return beyond
 
     def is_tuned(self, axes: Axes) -> NDArray[np.bool_]:
         """Tell on which axes gains or the greatest force of a command are in force (m,)."""

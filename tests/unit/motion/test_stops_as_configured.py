@@ -262,6 +262,21 @@ def test_an_axis_whose_next_command_is_not_possible_is_braked() -> None:
     assert plant.position - place < 0.3**2 / 10 + 0.1 * 0.3 + 0.01
 
 
+@pytest.mark.parametrize("sign", (1.0, -1.0))
+def test_an_axis_with_gains_of_a_command_keeps_its_soft_limits(sign: float) -> None:
+    """The configured gains follow 30 mm late, which is the set-point's lead when they come into force."""
+    for ends_by_itself in (True, False):
+        plant = Mass(viscous=0.0)
+        rig = rig_of(plant, position_max=0.3, position_min=-0.3)
+        rig.write(mode=VELOCITY | GAINS, velocity=0.3 * sign, k=825043.0, kz=-0.914)
+        for _ in range(3000):
+            if abs(plant.position) > 0.285 and not ends_by_itself:
+                rig.bank.stop(rig.axes, rig.now_ns + 300_000)
+            rig.tick()
+        assert np.abs(rig.trace("position")).max() < 0.3 + 1e-3
+        assert abs(plant.position) > 0.28 and rig.bank.is_idle(rig.axes)
+
+
 def test_a_tuned_axis_that_was_let_go_is_held_without_a_kick() -> None:
     peaks = []
     for mode in (POSITION, POSITION | MAX_FORCE):
