@@ -349,8 +349,7 @@ class LineUnit(ABC):
         misses: failed exchanges in a row after which the unit counts as lost; it is then reopened
             every few seconds, and the others on the line do not wait for it.
         silence_s: a poll that has begun and brought nothing for this long [s] loses the unit too, however many
-            exchanges have failed: its readings would pass for new. Longer where the time-outs of an exchange that is
-            repeated are.
+            exchanges have failed, and however long their time-outs are: its readings would pass for new.
     """
 
     name: str

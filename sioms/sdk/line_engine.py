@@ -15,9 +15,9 @@ from sioms.protocol.flags import PageState
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .connected import FIRST_PAUSE_NS, LONGEST_PAUSE_NS, Connected
 from .driver import LineDriver, LineUnit
-from .exchange import DeviceError, Exchange, LinkError, Pause, StateLost, Step, Steps, noting, while_wanted
+from .exchange import DeviceError, LinkError, Pause, StateLost, Steps, noting, while_wanted
 from .handles import LATER, Handle
-from .line import ATTEMPTS, Done, Line, Priority
+from .line import Done, Line, Priority
 from .outputs import Change
 from .parts import Parts
 
@@ -42,8 +42,6 @@ class _UnitState:
         self.mark = 0
         self.is_asked = False
         self.silent_ticks = self.usual_ticks = 0
-        self.silence_s = unit.silence_s
-        """As the unit says, but never so short that an exchange of a poll could not be repeated."""
 
 
 @dataclass(slots=True, eq=False)
@@ -86,7 +84,7 @@ class LineEngine(Connected):
             return
         for state in self._units:
             if state.is_up and self._is_silent(state):
-                error = LinkError(f"nothing for {state.silence_s:.2g} s")
+                error = LinkError(f"nothing for {state.unit.silence_s:g} s")
                 self._lose_unit(state, self._told(state.unit, error), now_ns)
             if state.is_up:
                 for block in state.unit.blocks:
@@ -97,7 +95,7 @@ class LineEngine(Connected):
     def _is_silent(self, state: _UnitState) -> bool:
         """Tell whether polls bring nothing, in ticks: time in which this process did not run is no silence."""
         state.silent_ticks += state.is_asked
-        return state.silent_ticks > state.silence_s * self.tick_hz + 2 * state.usual_ticks
+        return state.silent_ticks > state.unit.silence_s * self.tick_hz + 2 * state.usual_ticks
 
     def _start(self, state: _UnitState, now_ns: int) -> None:
         line = self.line
@@ -119,13 +117,7 @@ class LineEngine(Connected):
         state.as_of_ns = self._loop.as_of_ns()
         state.mark = self._outputs.mark()
         state.is_asked = True
-        yield from while_wanted(state.unit.poll(), lambda: True, partial(self._allow, state))
-
-    def _allow(self, state: _UnitState, step: Step) -> Step:
-        """Let a device be silent for as long as the attempts at an exchange last: so long it may take to answer."""
-        if isinstance(step, Exchange):
-            state.silence_s = max(state.silence_s, ATTEMPTS * (step.timeout_s + self._recovery_s))
-        return step
+        yield from state.unit.poll()
 
     def _opened(self, state: _UnitState, _: Any, error: Exception | None) -> None:
         state.busy = False

@@ -128,7 +128,7 @@ def test_a_report_is_a_page(tmp_path: Path) -> None:
     [
         (
             ("nobody",),
-            "nobody: no driver or register map of this name; there are: ascii-stream, ati-rdt, dynamixel",
+            "nobody: no driver or register map of this name; there are: arm, ascii-stream, ati-rdt",
         ),
         (("leadshin",), "did you mean leadshine?"),
         (("./mymap.toml",), "a register map is checked with its driver: give modbus-axis or modbus-io"),

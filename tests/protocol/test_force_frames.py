@@ -178,7 +178,7 @@ def test_schunk_commands() -> None:
     first = ifb.get(ifb.PRODUCT)
     assert first.data[4:] == request[4:] and first.repeatable
     tare, start = ifb.act(ifb.Command.TARE), ifb.act(ifb.Command.START)
-    assert tare.data.hex(" ") == "ff ff 00 00 01 00 12" and not tare.repeatable
+    assert tare.data.hex(" ") == "ff ff 00 00 01 00 12" and tare.repeatable
     assert start.data.hex(" ") == "ff ff 00 00 01 00 40"
     for step in (1, 2, 100):
         for number in (b"\x00\x00", b"\x01\x00", b"\xff\xff"):  # the box numbers its replies as it likes

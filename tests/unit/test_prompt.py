@@ -199,6 +199,6 @@ def test_a_fleet_tells_all_of_a_stop_before_who_hears_takes_its_processor(messag
                 return 1
 
     calls: Any = [(Cell, Call("tell", message))] * 3
-    assert _Together()._send(calls) == [1, 1, 1]
+    assert _Together()._send(calls, None) == [1, 1, 1]
     assert seen == [wanted] * 3
     assert os.sched_getscheduler(0) & ~os.SCHED_RESET_ON_FORK == os.SCHED_OTHER

@@ -244,7 +244,8 @@ def test_a_supply_off_behind_a_lost_link_loses_the_place(homing: bool, place_mm:
     for _ in range(3):
         with pytest.raises(LinkError):
             rig.do(rig.unit.poll())
-        rig.wait(0.6)
+        rig.wait(0.1)
+    rig.wait(1.5)
     rig.do(rig.unit.open())
     # at 0, and not locked: nothing that it says without its greeting differs
     told = homing or place_mm != 0
