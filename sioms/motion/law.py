@@ -173,7 +173,8 @@ class ControlLaw:
     def recalled(self, axis: int, place: float, now_ns: int, gains: Gains | None, offset: float | None) -> float:
         """Return the set-point at which a braced servo goes on with its force, by gains that come into force.
 
-        A motion is not force to be kept: then the set-point comes no farther from the axis than it is.
+        A motion is not force to be kept: then the set-point comes no farther from the axis than it is. Gains that would
+        need it farther away than an axis may be behind carry nothing: it stays.
 
         Args:
             axis: which.
@@ -196,6 +197,8 @@ class ControlLaw:
             keeps = 0.0
         if moves:
             keeps = min(max(keeps, min(lead, 0.0)), max(lead, 0.0))
+        if not abs(keeps) <= self._usual_error[axis]:
+            return place
         return at + keeps
 
     def forget(self, axes: NDArray[np.int64]) -> None:
@@ -245,9 +248,11 @@ class ControlLaw:
     def carry_on(self, axes: NDArray[np.int64]) -> None:
         """Have the integrals of axes at rest, for which a command has begun, go on with the force that holds them."""
         axes = axes[self._carries(axes) & (self.kind[axes] != FORCE) & ~self.limp[axes]]
-        limit, gain = self.force_limit[axes], self.k[axes] * (1.0 + self.kz[axes])
-        wish = self.output[axes] * (1.0 + self.kp[axes]) - self.offset[axes] - self.kb[axes] * self._velocity[axes]
-        self._integral[axes] = np.clip(wish - gain * self._error[axes], -limit, limit)
+        with np.errstate(over="ignore", invalid="ignore"):
+            wish = self.output[axes] * (1.0 + self.kp[axes]) - self.offset[axes] - self.kb[axes] * self._velocity[axes]
+            wish -= self.k[axes] * (1.0 + self.kz[axes]) * self._error[axes]
+        integral = np.clip(wish, -self.force_limit[axes], self.force_limit[axes])
+        self._integral[axes] = np.where(np.isfinite(integral), integral, 0.0)
 
     def _limit_force(self, axes: NDArray[np.int64]) -> None:
         """Judge how far axes may be behind.
@@ -297,10 +302,11 @@ class ControlLaw:
 
     def full_error(self, axes: NDArray[np.int64]) -> Vector:
         """Return the error at which the law asks for all the force of a servo, at its velocity; inf of a stepper."""
-        gain = self.k[axes] * (1.0 + self.kz[axes])
-        force = self.force_limit[axes] * (1.0 + np.abs(self.kp[axes])) + np.abs(self.kb[axes] * self._velocity[axes])
         error: Vector = np.full(len(axes), np.inf)
-        with np.errstate(over="ignore"):  # a gain of next to nothing asks for all the force nowhere
+        with np.errstate(over="ignore", invalid="ignore"):  # a gain of next to nothing asks for all the force nowhere
+            gain = self.k[axes] * (1.0 + self.kz[axes])
+            force = self.force_limit[axes] * (1.0 + np.abs(self.kp[axes]))
+            force += np.abs(self.kb[axes] * self._velocity[axes])
             np.divide(force, gain, out=error, where=(gain > 0.0) & ~self.stepper[axes])
         return error
 

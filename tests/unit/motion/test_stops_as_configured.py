@@ -223,6 +223,28 @@ def test_an_integral_carries_on_what_the_axis_held(gains: dict[str, float]) -> N
         assert abs(plant.position - place) < 1e-3
 
 
+@pytest.mark.parametrize("ki", (0.0, 300.0))
+@pytest.mark.parametrize(
+    "gains",
+    ({"k": 1e-12, "kb": -5.0}, {"k": 1e308, "kz": 10.0}, {"k": 1e-308, "kz": -0.5}, {"k": 1.0, "kb": 1e308}),
+    ids=str,
+)
+def test_gains_that_carry_nothing_leave_the_set_point(gains: dict[str, float], ki: float) -> None:
+    plant = Mass(viscous=10.0, pull=-2.0)
+    rig = rig_of(plant, position_min=None, position_max=None, ki=ki)
+    rig.write(mode=VELOCITY | GAINS, velocity=0.0, **gains)
+    rig.tick(10)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(1000)
+    rig.write(mode=VELOCITY, velocity=0.0)
+    rig.tick(5)
+    assert abs(rig.field("commanded_position") - plant.position) < 0.1
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(3000)
+    assert np.isfinite(rig.trace("force")).all()
+    assert abs(plant.velocity) < 0.01
+
+
 def test_a_command_that_was_possible_where_the_set_point_was_is_carried_out() -> None:
     plant = Mass(viscous=10.0, pull=-5.0)
     rig = rig_of(plant)
