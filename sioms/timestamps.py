@@ -14,7 +14,9 @@ import os
 import socket
 import sys
 import time
+from fcntl import ioctl
 from struct import unpack_from
+from termios import FIONREAD
 
 from sioms.descriptors import SO_TIMESTAMPNS
 
@@ -43,9 +45,6 @@ class Itimerspec(ctypes.Structure):
 
 def pending_bytes(sock: socket.socket) -> int:
     """Return how many bytes lie in a socket, of all packets together; 0 for one that is closed."""
-    from fcntl import ioctl  # few drivers ever need them
-    from termios import FIONREAD
-
     try:
         return int.from_bytes(ioctl(sock.fileno(), FIONREAD, bytes(4)), sys.byteorder)
     except OSError:
