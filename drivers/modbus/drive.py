@@ -10,6 +10,7 @@ import errno
 import math
 import time
 from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, assert_never
 
 import numpy as np
@@ -85,7 +86,7 @@ class DriveUnit(LineUnit):
         self._homed: bool | None = None
         self._moved_ns = 0
         """When it moved last, or did not home [ns]."""
-        self._runs = self._lost = False
+        self._runs = self._lost = self._is_slow = False
         self._polled_ns = 0
         self._epoch = 0
         self._jog = ""
@@ -162,7 +163,7 @@ class DriveUnit(LineUnit):
         """Stop, whatever goes on."""
         self._jog, self._homes, self._runs = "", False, False
         self._epoch += 1
-        return self._mapped.command("fastest")
+        return self._brake("fastest")
 
     # --- inside ----------------------------------------------------------------------------------
 
@@ -232,9 +233,9 @@ class DriveUnit(LineUnit):
                 if action.command is not None:
                     yield from self._start(action.command, action)
             case ActionKind.STOP:
-                yield from self._mapped.command("stop")
+                yield from self._brake("stop")
             case ActionKind.QUICK_STOP:
-                yield from self._mapped.command("fastest")
+                yield from self._brake("fastest")
             case ActionKind.HOME:
                 yield from self._home()
             case ActionKind.RESET:
@@ -242,8 +243,17 @@ class DriveUnit(LineUnit):
             case _:
                 assert_never(action.kind)
 
+    def _brake(self, stop: str) -> Steps:
+        """Stop, and no slower than the axis may, whatever ramp the command has that runs."""
+        if self._is_slow and "brake" in self._rmap.commands:
+            hardest = self.bank.settings[0].acceleration_max
+            with suppress(DeviceError):  # the stop must go out all the same
+                yield from self._mapped.command("brake", acceleration=hardest, deceleration=hardest)
+        yield from self._mapped.command(stop)
+
     def _start(self, command: Command, action: DriveAction) -> Steps:
         mode = ControlMode(command.control_mode)
+        self._is_slow = action.acceleration_max < self.bank.settings[0].acceleration_max
         ramps = {"acceleration": action.acceleration_max, "deceleration": action.acceleration_max}
         if mode & ControlMode.POSITION:
             if mode & ControlMode.VELOCITY:

@@ -86,6 +86,27 @@ def test_stop_and_emergency_stop(make: Callable[..., Rig]) -> None:
     assert rig.position == pytest.approx(0.0, abs=1e-5)
 
 
+@pytest.mark.parametrize("deaf", [False, True])
+@pytest.mark.parametrize("verb", ["stop", "emergency_stop"])
+def test_a_slow_ramp_of_a_command_does_not_prolong_a_stop(verb: str, deaf: bool) -> None:
+    """An AZ drive brakes for STOP with the ramp of the operation that runs; and is stopped if it takes no other."""
+    rig = az_rig()
+    rig.write(ControlMode.VELOCITY, velocity=0.1)
+    rig.go(0.5)
+    slow = ControlMode.VELOCITY | ControlMode.SPECIFIED_MAX_VEL_ACC
+    rig.write(slow, velocity=0.09, max_velocity=0.1, max_acceleration=0.05)
+    rig.go(0.3)
+    assert rig.drive.state()["velocity"] > 0
+    if deaf:
+        rig.drive.operate = lambda: None
+    getattr(rig.bank, verb)([0], rig.bus.clock_ns())
+    for action in rig.bank.take_actions():
+        rig.act(action)
+    took_s = rig.until_idle(5.0)
+    assert rig.drive.state()["velocity"] == 0
+    assert took_s > 1.0 if deaf else took_s < 0.3
+
+
 @RIGS
 @pytest.mark.parametrize("verb", ["stop", "emergency_stop"])
 def test_a_stop_voids_a_start_that_still_waits_for_the_line(make: Callable[..., Rig], verb: str) -> None:
