@@ -25,8 +25,8 @@ STATUS_NAMES = (
 # command -> whether a failed exchange of it may be repeated at all
 COMMANDS = {
     "position": False, "relative": False, "velocity": False, "force": False, "jog_speed": True, "jog_plus": False,
-    "jog_minus": False, "stop": True, "fastest": True, "brake": True, "home": False, "reset": True, "zero": False, "enable": True,
-    "disable": True, "watchdog": True, "watchdog_restart": True, "token": True,
+    "jog_minus": False, "stop": True, "fastest": True, "brake": True, "home": False, "reset": True, "zero": False,
+    "enable": True, "disable": True, "watchdog": True, "watchdog_restart": True, "token": True,
 }  # fmt: skip
 # quantity of a command -> SI unit
 SOURCES = {

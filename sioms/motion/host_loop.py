@@ -309,7 +309,7 @@ class AxisBank(Bank):
             axis_step.looked_at(loop, now_ns)
         loop.last_ns = last_ns if not first else now_ns - round(self._tick_s * 1e9)
         axis_step.begin_tick(loop, now_ns)
-        self._sequencer.begin_tick(loop.dt)
+        self._sequencer.pace.begin_tick(loop.dt)
         self._settle(now_ns)
         self._sequencer.release_held(now_ns)
         if self._queue.waits_for_markers:
@@ -341,7 +341,7 @@ class AxisBank(Bank):
         """
         if self._last_ns != self.loop.last_ns:
             self._last_ns = self.loop.last_ns
-            self._sequencer.begin_tick(self.loop.dt)
+            self._sequencer.pace.begin_tick(self.loop.dt)
         if self.plans.untold:
             self.plans.untold = 0
             self._sequencer.tell_ends()

@@ -23,6 +23,7 @@ from .arrival import Arrivals
 from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, SETTLING, STOP
 from .commands import Command
 from .law import ControlLaw
+from .pace import Pace
 from .plan_step import STILL, Plans
 from .planning import Planned, Planning
 from .profile import InfeasibleError, State
@@ -33,12 +34,6 @@ from .types import EventKind
 
 Axes = NDArray[np.int64]
 Floats = NDArray[np.float64]
-PIECES = 2
-"""Pieces of a period that are not short: time itself bounds how many of them end in a tick, and they keep their
-instants.
-"""
-SPARE_SHARE, BEGIN_S = 0.05, 50e-6
-"""Share of the period, and what beginning a command takes of it [s]: how many may follow short ones on axes at rest."""
 
 _MOVING = AxisStatus.MOVING
 _FORCE, _STOPPING = _MOVING | AxisStatus.FORCE_MODE, _MOVING | AxisStatus.STOPPING
@@ -61,10 +56,6 @@ class Sequencer:
             what follows from there.
         in_motion: (n,) int64, written here.
         tick_s: nominal period [s].
-
-    How many commands begin from one tick to the next is bounded, however short they are. After a short one (less than a
-    PIECES-th of the period) an axis in motion begins as many as longer ones could have been, one at rest only its first
-    and what is left of a few that all share. What follows waits at rest for the next tick.
     """
 
     def __init__(
@@ -106,13 +97,7 @@ class Sequencer:
         self._todo: dict[int, None] = {}
         self._ended_ns, self._idle_ns = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
         """When steps have found ends that are yet to be told [ns]; 0: they have not."""
-        self._tick_s = tick_s
-        self._begun = law.begun
-        """Commands begun after short ones since the last tick began."""
-        self._pieces = 2 * PIECES
-        self._spare = self._spare_a_tick = max(2, int(SPARE_SHARE * tick_s / BEGIN_S))
-        self._held: dict[int, bool] = {}
-        """Axes whose next command waits for the next tick; whether it then takes over from what runs."""
+        self.pace = Pace(law.begun, tick_s)
 
     # -- what the bank asks for ---------------------------------------------------------------
 
@@ -128,11 +113,10 @@ class Sequencer:
         self._todo.update(dict.fromkeys(axes.tolist()))
         rows = self.store.row[axes]
         self._row_signals[rows] = self._row_checked[rows] = self._row_taken[rows] = False
-        often = self._begun[axes] >= self._pieces
-        if often.any():  # they go on with what they do until the next tick
-            self._held.update(dict.fromkeys(axes[often].tolist(), True))
-            self.refresh(axes[often])
-            axes = axes[~often]
+        may = self.pace.take_over(axes)
+        if not may.all():  # they go on with what they do until the next tick
+            self.refresh(axes[~may])
+            axes = axes[may]
             if not axes.size:
                 return
         self.store.cut(axes, now_ns)
@@ -141,12 +125,12 @@ class Sequencer:
     @property
     def has_work(self) -> bool:
         """Tell whether commands wait for the next tick, or to be planned ahead."""
-        return bool(self._held or self._todo)
+        return bool(self.pace.held or self._todo)
 
     @property
     def is_plain(self) -> bool:
         """Tell whether no axis presses, or has, or is held back, and no arrival is looked at."""
-        return not (self.any_force or self._held or self.arrivals.watched or self._law.force_ends.any)
+        return not (self.any_force or self.pace.held or self.arrivals.watched or self._law.force_ends.any)
 
     def is_taken_up(self, axis: int) -> bool:
         """Tell whether the play of an axis is taken up at the end of what runs."""
@@ -160,19 +144,12 @@ class Sequencer:
         store.next_ns = min(store.next_ns, *map(store.end_ns.item, axes))
         self.advance(now_ns)
 
-    def begin_tick(self, dt: float) -> None:
-        """A tick begins, dt after the last [s]: further commands may begin."""
-        self._begun[:] = 0
-        self._pieces = PIECES + int(PIECES * dt / self._tick_s)
-        self._spare = self._spare_a_tick
-
     def release_held(self, now_ns: int) -> None:
         """Let the commands that waited for this tick begin at now."""
-        if not self._held:
+        if not self.pace.held:
             return
-        held, self._held = self._held, {}
-        self.release(np.array(list(held)), now_ns)
-        taking = np.array([axis for axis, takes_over in held.items() if takes_over], dtype=np.int64)
+        held, taking = self.pace.take_held()
+        self.release(held, now_ns)
         if taking.size:
             self.store.cut(taking, now_ns)
 
@@ -207,10 +184,10 @@ class Sequencer:
         self._queue.clear(axes)
         self.store.uncut(axes)
         self._ready[axes] = False
-        if self._todo or self._held:
+        self.pace.forget(axes)
+        if self._todo:
             for axis in axes.tolist():
                 self._todo.pop(axis, None)
-                self._held.pop(axis, None)
 
     def plans(self, fresh: NDArray[np.bool_]) -> Plans:
         """Return what steps go on with; ``fresh`` is theirs to fill."""
@@ -395,9 +372,7 @@ class Sequencer:
             self._signal(row, now_ns)
         queue.load_heads(axes)
         free = queue.has_head[axes] & ~queue.gated_synch[axes] & ~queue.gated_marker[axes]
-        short = store.duration[rows] * PIECES < self._tick_s
-        if short.any():
-            self._hold_back(axes, state, short, free)
+        self.pace.follow(axes, store.duration[rows], np.abs(state[:, 1]) <= STILL, free)
         begins = self._recalled(axes, state, free, now_ns) if self._law.any_braced else state
         for i in np.flatnonzero(free & ~self._ready[axes]).tolist():
             p, v, a = begins[i].tolist()
@@ -425,18 +400,6 @@ class Sequencer:
                 state[i, 0] = self.planning.recalled(axis, command, (p, v, a), now_ns)
                 self._ready[axis] = False
         return state
-
-    def _hold_back(self, axes: Axes, state: Floats, short: NDArray[np.bool_], free: NDArray[np.bool_]) -> None:
-        """Count what follows short commands; take out of ``free`` the axes that have had their share of this tick."""
-        begun, rests = self._begun[axes], np.abs(state[:, 1]) <= STILL
-        over = free & short & (begun >= np.where(rests, 1, self._pieces))
-        for i in np.flatnonzero(over).tolist():
-            if rests[i] and self._spare:
-                self._spare -= 1
-            else:
-                free[i] = False
-                self._held[int(axes[i])] = False
-        self._begun[axes] = begun + (short & free)
 
     def _look_at_arrivals(self, axes: Axes, now_ns: int) -> Axes:
         """Try point moves that missed their targets again, as often as is allowed; return the axes that have ended."""
@@ -489,9 +452,7 @@ class Sequencer:
         store.begin(axes, start_ns, fraction)
         self._ready[axes] = False
         self._queue.has_head[axes] = False
-        if self._held:
-            for axis in axes.tolist():
-                self._held.pop(axis, None)
+        self.pace.forget(axes)
         if self.any_force or self._law.force_ends.any:
             self._law.force_ends.end(axes)
         recalled = axes[:0]
