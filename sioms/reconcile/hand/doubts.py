@@ -1,5 +1,5 @@
-"""What is named of a hand, and what else it could be: two effects that together are a third, and effects that too few
-grasps tell from each other.
+"""What is named of a hand, and what else it could be: two effects that together are a third, effects that too few
+grasps tell from each other, and effects beside the named ones that a search by stated noise cannot see.
 """
 
 from __future__ import annotations
@@ -10,10 +10,12 @@ from dataclasses import replace
 import numpy as np
 
 from sioms.reconcile.effect import TERM_PREFIX
+from sioms.reconcile.hand.grasps import Floats
 from sioms.reconcile.hand.rows import HandData
 from sioms.reconcile.sensors.effect import SensorModel
-from sioms.reconcile.sensors.fit import ratios, refit
+from sioms.reconcile.sensors.fit import Fit, half_intervals, ratios, refit
 from sioms.reconcile.sensors.plausible import physical
+from sioms.reconcile.sensors.screen import screening_columns
 from sioms.reconcile.sensors.verdict import Proposal, SensorVerdict
 from sioms.reconcile.thresholds import AMBIGUOUS, SENSOR
 from sioms.reconcile.verdict import Outcome
@@ -28,6 +30,9 @@ PATIENCE = 30  # steps of a fit
 CERTAIN = 4.5
 """Logarithm of the likelihood by which a look-alike must be worse: three standard deviations. A grasp counts once, for
 its rows under several loads have their errors in common."""
+LARGE = 0.5  # times its natural size that an effect may have before it is said that it is not excluded
+UNTOLD = 1e-6  # times its noise by which a row must change to tell of an effect
+SLIGHT = 1.0  # times the stated noise of one row by which an effect must change at least one
 
 
 def doubted(
@@ -70,8 +75,7 @@ def unsure(
     """
     if v.outcome not in (Outcome.NAMED, Outcome.AMBIGUOUS):
         return v
-    weights = 1.0 / np.maximum(ratios(data, v.model), 1e-9)[data.view]
-    good = refit(data, v.model, weights, (), PATIENCE)
+    good, weights = _by_scatter(data, v.model)
     known = {frozenset(names) for names in (*v.alternatives, tuple(v.model.effects))}
     open_ = []
     for effect in v.effects:
@@ -88,6 +92,66 @@ def unsure(
         v, outcome=Outcome.AMBIGUOUS, alternatives=(*v.alternatives, *(tuple(m.effects) for m in open_)),
         experiments=propose([v.model, *open_]),
     )  # fmt: skip
+
+
+def overlooked(
+    v: SensorVerdict,
+    data: HandData,
+    scatter: Sequence[float],
+    propose: Callable[[Sequence[SensorModel]], tuple[Proposal, ...]],
+) -> SensorVerdict:
+    """List effects that beside the named ones explain more than chance does, and say how large others may be.
+
+    The search counts by the stated noise where rows are too few to tell their scatter. Where they scatter a third of
+    it, as a dozen grasps of a quiet hand do, an effect well above what they scatter is below its floor. Here it counts
+    by the likelihood with each view's own scatter, as look-alikes do, and by an interval that does not hold zero.
+
+    Args:
+        v: the verdict; data: all rows; scatter: by how many times its stated noise each view is taken to scatter.
+        propose: what decides between models.
+    """
+    if v.outcome is Outcome.UNEXPLAINED:
+        return v
+    good, weights = _by_scatter(data, v.model)
+    shown, wide = dict[str, SensorModel](), list[str]()
+    for name, effect in v.model.library.items():
+        if not effect.rankable or name.startswith(TERM_PREFIX) or name in v.model.effects:
+            continue
+        if not np.any(np.abs(screening_columns(data, good.model, effect)) > UNTOLD):
+            continue
+        more = refit(data, good.model.with_effect(name, good.model.plain(name)), weights, (), PATIENCE)
+        q = effect.primary
+        at = next(i for i, f in enumerate(more.free) if (f.effect, f.symbol) == (name, q.symbol))
+        half, value = float(half_intervals(data, more, weights)[at]), float(more.model.effects[name][q.symbol][0])
+        unit = "" if q.unit == "1" else f" {q.unit}"
+        told = f"{effect.title}, {q.symbol} {value - half:.3g} to {value + half:.3g}{unit}"
+        sure = abs(value - effect.neutral) > half and _worse(data, more.model, good.model) > CERTAIN
+        if sure and physical(more.model, name) and not slight(data, scatter, more.model, name):
+            shown[told] = more.model
+        elif abs(value - effect.neutral) + half > LARGE * q.size:
+            wide.append(told)
+    best = max(shown.values(), key=lambda m: _worse(data, m, good.model), default=good.model)
+    shown = {told: m for told, m in shown.items() if _worse(data, best, m) < CERTAIN}
+    notes = v.notes + (f"not excluded by these rows: {'; '.join(wide)}",) * bool(wide)
+    if not shown:
+        return replace(v, notes=notes)
+    return replace(
+        v, outcome=Outcome.AMBIGUOUS, alternatives=(*v.alternatives, *(tuple(m.effects) for m in shown.values())),
+        experiments=v.experiments or propose([v.model, *shown.values()]),
+        notes=(*notes, f"these rows show, too few to name it: {' or '.join(shown)}"),
+    )  # fmt: skip
+
+
+def slight(data: HandData, scatter: Sequence[float], model: SensorModel, name: str) -> bool:
+    """Say whether an effect of a model changes no row by as much as one reading of it is stated to scatter."""
+    change = np.abs(data.miss(data.predict(model)) - data.miss(data.predict(model.without_effect(name))))
+    return bool(np.max(change * np.array(scatter)[data.view]) < SLIGHT)
+
+
+def _by_scatter(data: HandData, model: SensorModel) -> tuple[Fit, Floats]:
+    """Fit a model with each view weighed by its own scatter; return the weights, too."""
+    weights = 1.0 / np.maximum(ratios(data, model), 1e-9)[data.view]
+    return refit(data, model, weights, (), PATIENCE), weights
 
 
 def _worse(data: HandData, good: SensorModel, rival: SensorModel) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.hand.belief import settles
-from sioms.reconcile.hand.doubts import doubted, unsure
+from sioms.reconcile.hand.doubts import doubted, overlooked, slight, unsure
 from sioms.reconcile.hand.grasps import Floats, Grasps
 from sioms.reconcile.hand.model_file import Noise
 from sioms.reconcile.hand.plan import propose
@@ -37,7 +37,6 @@ TITLES = {
 SPANNED = 1e-2  # share of what is fitted that is no further number
 LEAST_FREE = 20  # rows of a view beyond what is fitted that tell its scatter
 TAILS = 1.5  # times the middle of what is left that its root mean square may be, and still be noise
-SLIGHT = 1.0  # times the stated noise of one row by which an effect must change at least one
 ROUNDS = 4  # searches without effects that are too small to be named
 LEAST, WORST = 0.5, 3.0  # times its stated noise that a view may scatter
 
@@ -215,17 +214,18 @@ def reconcile(
     subject = prepare(grasps, model, noise)
     verdict = analyse(subject, options)
     for _ in range(ROUNDS):  # what is left of one may look like another
-        slight = slight_ones(subject, verdict)
-        if not slight:
+        dropped = slight_ones(subject, verdict)
+        if not dropped:
             break
-        library = {name: effect for name, effect in subject.model.library.items() if name not in slight}
+        library = {name: effect for name, effect in subject.model.library.items() if name not in dropped}
         subject = replace(
             subject, model=replace(subject.model, library=library),
-            names=tuple(name for name in subject.names if name not in slight),
-            notes=(*subject.notes, *slight.values()),
+            names=tuple(name for name in subject.names if name not in dropped),
+            notes=(*subject.notes, *dropped.values()),
         )  # fmt: skip
         verdict = analyse(subject, options)
-    return unsure(doubted(verdict, subject.whole, subject.propose), subject.whole, subject.propose)
+    said = unsure(doubted(verdict, subject.whole, subject.propose), subject.whole, subject.propose)
+    return overlooked(said, subject.whole, subject.scatter, subject.propose)
 
 
 def slight_ones(subject: HandSubject, v: SensorVerdict) -> dict[str, str]:
@@ -233,10 +233,9 @@ def slight_ones(subject: HandSubject, v: SensorVerdict) -> dict[str, str]:
 
     What all rows have alike, an estimator's bias or a sensor's own scale, is within that and looks like a small effect.
     """
-    d, found = subject.whole, dict[str, str]()
+    found = dict[str, str]()
     for effect in v.effects:
-        change = np.abs(d.miss(d.predict(v.model)) - d.miss(d.predict(v.model.without_effect(effect.name))))
-        if float(np.max(change * np.array(subject.scatter)[d.view])) < SLIGHT:
+        if slight(subject.whole, subject.scatter, v.model, effect.name):
             told = ", ".join(f"{p.symbol} {p.value:.2g}" for p in effect.parameters)
             found[effect.name] = f"{effect.title} ({told}) is within the stated noise of every row: not named"
     return found
