@@ -30,7 +30,7 @@ PATIENCE = 30  # steps of a fit
 CERTAIN = 4.5
 """Logarithm of the likelihood by which a look-alike must be worse: three standard deviations. A grasp counts once, for
 its rows under several loads have their errors in common."""
-LARGE = 0.5  # times its natural size that an effect may have before it is said that it is not excluded
+POSSIBLE = 0.5  # times its natural size that an effect may have before it is said that it is not excluded
 UNTOLD = 1e-6  # times its noise by which a row must change to tell of an effect
 SLIGHT = 1.0  # times the stated noise of one row by which an effect must change at least one
 
@@ -128,7 +128,7 @@ def overlooked(
         sure = abs(value - effect.neutral) > half and _worse(data, more.model, good.model) > CERTAIN
         if sure and physical(more.model, name) and not slight(data, scatter, more.model, name):
             shown[told] = more.model
-        elif abs(value - effect.neutral) + half > LARGE * q.size:
+        elif abs(value - effect.neutral) + half > POSSIBLE * q.size:
             wide.append(told)
     best = max(shown.values(), key=lambda m: _worse(data, m, good.model), default=good.model)
     shown = {told: m for told, m in shown.items() if _worse(data, best, m) < CERTAIN}
