@@ -12,7 +12,7 @@ from sioms.native.language import step
 from sioms.protocol.flags import AxisStatus
 
 from .axis_step import FORCE, POSITION
-from .plan_step import Plans, load
+from .plan_step import Plans, load, look_at_plan
 from .stop_step import is_behind
 from .store import UNCUT_NS
 
@@ -33,18 +33,8 @@ def may_begin(s: Plans, i: int, replaces: int) -> int:
 @step
 def look_at_state(s: Plans, i: int, now_ns: int) -> int:
     """Set ``state`` to that in which a command of an axis begins at now, as ``Sequencer._end_state`` finds it."""
-    a = s.loop
-    n = a.n
-    t = (now_ns - a.segment_ns[i]) * 1e-9
-    c1 = a.present[n + i]
-    c2 = a.present[2 * n + i]
-    c3 = a.present[3 * n + i]
-    c4 = a.present[4 * n + i]
-    c5 = a.present[5 * n + i]
-    s.state[0] = a.present[i] + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
-    s.state[1] = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
-    s.state[2] = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
-    if is_behind(a, i):
+    look_at_plan(s, i, now_ns)
+    if is_behind(s.loop, i):
         look_at_late(s, i)
     return 0
 

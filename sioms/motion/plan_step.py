@@ -30,7 +30,8 @@ class Plans(Record):
 
     ``awaited``: somebody waits for the end of a motion, which is the bank's then. Else steps note when the command of
     an axis has ended, ``ended_ns``, and when it came to rest, ``idle_ns``, by the ticks in which that was found [ns];
-    0: it has not. ``untold``: how much of it the bank has yet to tell. ``state``: (3,) in which a command begins.
+    0: it has not. ``untold``: how much of it the bank has yet to tell. ``state``: (3,) in which a command, or a stop,
+    begins.
     """
 
     loop: Loop
@@ -135,6 +136,23 @@ def end_plan(s: Plans, i: int, now_ns: int) -> int:
     else:
         s.idle_ns[i] = now_ns
         become(s, i, HOLD)
+    return 0
+
+
+@step
+def look_at_plan(s: Plans, i: int, now_ns: int) -> int:
+    """Set ``state`` to that of the set-point of an axis at now."""
+    a = s.loop
+    n = a.n
+    t = (now_ns - a.segment_ns[i]) * 1e-9
+    c1 = a.present[n + i]
+    c2 = a.present[2 * n + i]
+    c3 = a.present[3 * n + i]
+    c4 = a.present[4 * n + i]
+    c5 = a.present[5 * n + i]
+    s.state[0] = a.present[i] + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
+    s.state[1] = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
+    s.state[2] = 2 * c2 + t * (6 * c3 + t * (12 * c4 + t * 20 * c5))
     return 0
 
 

@@ -14,7 +14,7 @@ from sioms.native.numbers import whole
 from sioms.protocol.flags import AxisStatus
 
 from .axis_step import FORCE, HOLD, REST, STOP, Loop
-from .plan_step import PIECE, Plans
+from .plan_step import PIECE, Plans, look_at_plan
 from .profile import MAX_SEGMENTS
 from .store import NEVER_NS, UNCUT_NS
 
@@ -76,14 +76,9 @@ def brake(s: Plans, i: int, now_ns: int) -> int:
     """Let an axis stop at maximum deceleration from its set-point at now."""
     a = s.loop
     n = a.n
-    t = (now_ns - a.segment_ns[i]) * 1e-9
-    c1 = a.present[n + i]
-    c2 = a.present[2 * n + i]
-    c3 = a.present[3 * n + i]
-    c4 = a.present[4 * n + i]
-    c5 = a.present[5 * n + i]
-    position = a.present[i] + t * (c1 + t * (c2 + t * (c3 + t * (c4 + t * c5))))
-    velocity = c1 + t * (2 * c2 + t * (3 * c3 + t * (4 * c4 + t * 5 * c5)))
+    look_at_plan(s, i, now_ns)
+    position = s.state[0]
+    velocity = s.state[1]
     row = s.row[i]
     duration = abs(velocity) / a.deceleration[i]
     final = position + 0.5 * velocity * duration
