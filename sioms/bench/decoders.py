@@ -301,7 +301,7 @@ class _Line:
                 self._answers.append((reply(number, 0), (0, 0)))
             case verbs.Open():
                 self._answers.append((reply(number, [number, [], [0], -1, [1, 1]]), (0, 0, 0)))
-            case _ if number != OWN_NUMBERS:
+            case _ if number and number != OWN_NUMBERS:  # 0: a notice, which has no answer
                 self._answers.append((reply(number), ()))
 
     def close(self) -> None: ...

@@ -171,13 +171,13 @@ def decode_reply(packet: bytes, most: int = MAX_PACKET) -> list[Any]:
         MalformedMessage: anything else.
     """
     message = decode(packet, most)
-    if 4 <= len(message) <= 6 and type(message[2]) is int:
+    if 4 <= len(message) <= 6 and message[0] == 0 and type(message[2]) is int and (message[1] or message[2]):
         message += (False, 0)[len(message) - 4 :]
         if message[2] and type(message[3]) is str:
             message[3] = printable(message[3])
         if type(message[4]) is bool and type(message[5]) is int and (not message[2] or type(message[3]) is str):
             return message
-    raise MalformedMessage("decode reply: not an array of 0, id, errno and value or text")
+    raise MalformedMessage("decode reply: not an array of 0, id, errno and value or text; id 0 is for errors only")
 
 
 def short_reply(packet: bytes, number: int) -> list[Any] | None:

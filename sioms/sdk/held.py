@@ -16,7 +16,7 @@ from typing import Any
 
 from sioms.protocol.driver_verbs import HeldSilent
 from sioms.protocol.flags import ControlMode, NodeClass, Request, WriteFlag
-from sioms.protocol.messages import MAX_PACKET, decode_reply
+from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply
 from sioms.protocol.nodeinfo import ChannelInfo
 from sioms.protocol.records import WRITE, WRITE_STRUCT
 from sioms.protocol.verbs import Ioctl, Keepalive, Message, Write
@@ -169,7 +169,10 @@ class Held:
                 self.detach()
                 found = found or OSError(errno.EIO, f"{self.name}: its device does not serve it any more")
                 break
-            error = self._answered(*decode_reply(packet))
+            try:
+                error = self._answered(*decode_reply(packet))
+            except MalformedMessage as malformed:
+                return self._give_up(f"its device answers its holder with what is none: {malformed}", errno.EPROTO)
             found = error if found is None or isinstance(found, AtLimitError) else found
         if not self._driven:
             self._send_wanted()
@@ -182,10 +185,10 @@ class Held:
             return None
         return self._give_up(f"its device has left an order of its holder unanswered for {silent_ns * 1e-9:.2g} s")
 
-    def _give_up(self, why: str) -> OSError:
+    def _give_up(self, why: str, errno_: int = errno.ETIMEDOUT) -> OSError:
         self.detach()
         self._told(HeldSilent(self.name, why))
-        return OSError(errno.ETIMEDOUT, f"{self.name}: {why}; the daemon is to stop it")
+        return OSError(errno_, f"{self.name}: {why}; the daemon is to stop it")
 
     def _answered(self, _: int, number: int, errno_: int, value: Any, __: bool, as_of_ns: int) -> OSError | None:
         """Take an answer; return what is wrong.

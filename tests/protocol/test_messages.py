@@ -372,6 +372,7 @@ def test_what_unpacks_to_too_much_is_refused_before_it_is_unpacked() -> None:
     [
         [0, 1], [0, 1, 0], [0, 1, None, 1], [0, 1, [], "x"], [0, 1, 5, None], [0, 1, 5, [1]], [0, 1, 0, None, 1],
         [0, 1, 0, None, False, None], [0, 1, 0, None, False, 1.5], [0, 1, 0, None, False, 0, 0], [0, 1, True, "x"],
+        [1, 1, 0, None], [0, 0, 0, None], [0, 0, 0, "gone", False, 0],
     ],
 )  # fmt: skip
 def test_what_is_no_reply(message: list[object]) -> None:

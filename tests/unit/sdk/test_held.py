@@ -178,3 +178,10 @@ def test_what_is_heard_between_two_ticks_is_told_once_and_kept_for_the_tick(driv
     assert heard is not None and "does not serve it any more" in str(heard) and not watched
     assert held.hear() is None, "once, or what it brings about would call it again"
     assert held.trouble() is heard and held.trouble() is None
+
+
+def test_what_is_no_answer_lets_the_node_go_and_has_it_stopped(driver: Driver) -> None:
+    driver.sock.send(b"\x93\x00\x00\x00")
+    trouble = driver.held.trouble()
+    assert trouble is not None and trouble.errno == errno.EPROTO and "array of 0, id" in str(trouble)
+    assert not driver.held.is_there and [type(message) for message in driver.told] == [HeldSilent]
