@@ -15,6 +15,7 @@ import tomllib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator, Mapping
     from pathlib import Path
 
 MOST_BYTES = 1 << 22
@@ -25,6 +26,9 @@ _LONGEST = 200
 MOST_DOTS = 200
 """In what may be a key; a sentence has fewer."""
 _NO_KEY = re.compile(r"[=\[\]{},#\n]")
+_HEADS = 2
+"""Levels on which a table has a head of its own."""
+_BARE_KEY = re.compile(r"[A-Za-z0-9_-]+")
 
 
 def read_bytes(path: Path, most: int = MOST_BYTES) -> bytes:
@@ -73,6 +77,67 @@ def json_of(text: str | bytes) -> Any:
         raise ValueError(f"arrays or objects nested too deep; want at most {DEEPEST} deep") from None
     _check(value, "", 0)
     return value
+
+
+def toml_text(tables: Mapping[str, Any]) -> str:
+    """Return tables as TOML that ``toml_of`` reads back exactly.
+
+    Tables have heads of their own down to the second level, arrays of tables on every level; what is below them is in
+    line.
+
+    Raises:
+        TypeError: a value that ``toml_of`` does not return.
+    """
+    return "\n".join(_lines(tables, ())).lstrip() + "\n"
+
+
+def _lines(table: Mapping[str, Any], above: tuple[str, ...]) -> Iterator[str]:
+    below = {key: value for key, value in table.items() if _has_head(value, len(above))}
+    for key, value in table.items():
+        if key not in below:
+            yield f"{toml_key(key)} = {toml_value(value)}"
+    for key, value in below.items():
+        names = (*above, toml_key(key))
+        head = ".".join(names)
+        for one in value if isinstance(value, list) else [value]:
+            if isinstance(value, list):
+                yield f"\n[[{head}]]"
+            elif not one or not all(_has_head(inner, len(names)) for inner in one.values()):
+                yield f"\n[{head}]"
+            yield from _lines(one, names)
+
+
+def _has_head(value: object, depth: int) -> bool:
+    if isinstance(value, list):
+        return bool(value) and all(isinstance(one, dict) for one in value)
+    return isinstance(value, dict) and depth < _HEADS
+
+
+def toml_key(name: str) -> str:
+    """Return a key as TOML, quoted where it must be."""
+    return name if _BARE_KEY.fullmatch(name) else toml_value(name)
+
+
+def toml_value(value: Any) -> str:
+    """Return a value as TOML that ``toml_of`` reads back exactly; lists of lists have a line for each.
+
+    Raises:
+        TypeError: a value that ``toml_of`` does not return.
+    """
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+        case int() | float():
+            return repr(value)
+        case dict():
+            return "{ " + ", ".join(f"{toml_key(key)} = {toml_value(one)}" for key, one in value.items()) + " }"
+        case list() | tuple() if value and isinstance(value[0], list | tuple):
+            return "[\n" + "".join(f"  {toml_value(row)},\n" for row in value) + "]"
+        case list() | tuple():
+            return "[" + ", ".join(toml_value(one) for one in value) + "]"
+    raise TypeError(f"write TOML: a {type(value).__name__}; want a number, a text, a truth, a list or a table")
 
 
 def json_text(value: object) -> str:

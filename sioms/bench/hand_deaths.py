@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 
 from sioms.check.daemon import Daemon, wait_for
 from sioms.client.command import command
-from sioms.hand.slow import slowed, toml
+from sioms.documents import toml_text
+from sioms.hand.slow import slowed
 
 from .figures import Bar, Report
 from .killing import lives
@@ -153,7 +154,7 @@ def bench_holding(options: Options, report: Report) -> None:
     kinds, late = list[str](), 0
     while sum(map(len, found.values())) + failed.total() < wanted and lame.total() + late < wanted:
         try:
-            with Daemon(toml(tables()), ready_s=READY_S) as daemon:
+            with Daemon(toml_text(tables()), ready_s=READY_S) as daemon:
                 _life(daemon, chance, kinds, wanted, found, failed, lame, report)
         except RuntimeError as error:  # a daemon that is not ready in time says nothing of those that were
             late += 1

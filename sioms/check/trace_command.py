@@ -5,7 +5,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -16,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from sioms.children import ends_with_us
+from sioms.documents import toml_text
 
 from .daemon import Daemon
 from .rigs import LINES
@@ -145,23 +145,8 @@ def configuration(trace: Trace) -> tuple[str, str]:
         ) from None
     line[kind] = "{port}"
     table["line"] = line
-    keys = "\n".join(f"{key} = {_toml(value)}" for key, value in table.items())
-    return f'[workcell]\nname = "replay"\n[device.{header["device"]}]\n{keys}\n', kind
-
-
-def _toml(value: Any) -> str:
-    """Return a value of JSON as TOML."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, Mapping):
-        pairs = (f"{_key(key)} = {_toml(each)}" for key, each in value.items())
-        return "{ " + ", ".join(pairs) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_toml(each) for each in value) + "]"
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return repr(value)
-
-
-def _key(key: str) -> str:
-    return key if re.fullmatch(r"[\w-]+", key) else _toml(key)
+    cell = {"workcell": {"name": "replay"}, "device": {str(header["device"]): table}}
+    try:
+        return toml_text(cell), kind
+    except TypeError as error:
+        raise BadTrace(f"read the trace's header: {error}") from None

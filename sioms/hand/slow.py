@@ -15,6 +15,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from sioms.documents import toml_value
+
 SLOWEST = 0.01
 PROCESS = "simulation"
 """In which all simulated devices of a slowed cell are: on a busy machine most of a tick is to be woken for it."""
@@ -61,11 +63,14 @@ def slowed(tables: Mapping[str, Any], pace: float, folder: Path) -> Table:
         folder: of the configuration; files that it names are named by their whole path.
 
     Raises:
-        ValueError: a pace out of its range, or a device whose driver has no simulation that can be slowed.
+        ValueError: a pace out of its range, tables that are none of a cell, or a device whose driver has no simulation
+            that can be slowed.
     """
     if not SLOWEST <= pace <= 1.0:
         raise ValueError(f"slow cell: a pace of {pace:g}; want {SLOWEST:g} to 1")
     found: Table = copy.deepcopy(dict(tables))
+    _want_tables("", found)
+    _want_tables("device.", found.get("device", {}))
     for name, device in found.get("device", {}).items():
         powers = _POWERS.get(device.get("driver", ""))
         if powers is None:
@@ -83,17 +88,25 @@ def slowed(tables: Mapping[str, Any], pace: float, folder: Path) -> Table:
     return found
 
 
+def _want_tables(above: str, tables: Table) -> None:
+    for name, one in tables.items():
+        if not all(isinstance(table, dict) for table in (one if isinstance(one, list) and not above else [one])):
+            raise ValueError(f"slow cell: {above}{name} = {toml_value(one)}; want a table")
+
+
 def _axes(device: Table) -> list[Table]:
     axes = device.get("axis", [])
-    return axes if isinstance(axes, list) else []
+    return [axis for axis in axes if isinstance(axis, dict)] if isinstance(axes, list) else []
 
 
 def _keep_limits(device: Table) -> None:
     """Say how far axes may be behind and be pushed, which else go with their velocities: forces bend as far as ever."""
     for axis in _axes(device):
-        fastest = axis.get("velocity_max", 1.0)
+        fastest = _number("velocity_max", axis.get("velocity_max", 1.0))
         axis.setdefault("following_error_max", _FOLLOWS_S * fastest)
-        axis["watch"] = {"tolerance": _JITTER_S * fastest, **axis.get("watch", {})}
+        watch = axis.get("watch", {})
+        _want_tables("", {"watch": watch})
+        axis["watch"] = {"tolerance": _JITTER_S * fastest, **watch}
 
 
 def _scale(table: Table, powers: Mapping[str, Any], pace: float) -> None:
@@ -102,14 +115,21 @@ def _scale(table: Table, powers: Mapping[str, Any], pace: float) -> None:
             exponent, usual = power
             value = table.get(key, usual)
             if value is not None:
-                table[key] = value * pace**exponent
+                table[key] = _number(key, value) * pace**exponent
             continue
         below = table.get(key)
         if below is None and key == "mount":
             below = table[key] = {}
         for one in below if isinstance(below, list) else [below]:
             if one is not None:
+                _want_tables("", {key: one})
                 _scale(one, power, pace)
+
+
+def _number(key: str, value: Any) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise ValueError(f"slow cell: {key} = {toml_value(value)}; want a number")
+    return value
 
 
 def _whole_paths(table: Table, folder: Path) -> None:
@@ -118,30 +138,3 @@ def _whole_paths(table: Table, folder: Path) -> None:
             _whole_paths(value, folder)
         elif key in _FILES and value:
             table[key] = str((folder / value).resolve())
-
-
-def toml(tables: Mapping[str, Any]) -> str:
-    """Return a cell's configuration as text: a section for each table of it, one for each device, all else in line."""
-    lines = []
-    for section, content in tables.items():
-        parts = content.items() if section == "device" else [("", content)]
-        for name, table in parts:
-            lines.append(f"\n[{section}.{_key(name)}]" if name else f"\n[{section}]")
-            lines += [f"{_key(key)} = {_value(value)}" for key, value in table.items()]
-    return "\n".join(lines).lstrip() + "\n"
-
-
-def _key(name: str) -> str:
-    return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else _value(name)
-
-
-def _value(value: Any) -> str:
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_key(key)} = {_value(one)}" for key, one in value.items()) + " }"
-    if isinstance(value, list | tuple):
-        return "[" + ", ".join(_value(one) for one in value) + "]"
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return '"' + value.replace("\\", "\\\\").replace('"', '\\"') + '"'
-    return repr(value)

@@ -20,7 +20,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.documents import toml_of
+from sioms.documents import toml_of, toml_text
 from sioms.tactile.cylinder import DEFAULT_SHEAR_MODULUS_PA, Cylinder
 from sioms.tactile.emap import MOST_EXTENT, e_map, highest_needed
 from sioms.tactile.model import Spectra, StrainTable, adhering, bounded, elliptic, strain_table
@@ -342,30 +342,7 @@ def from_toml(text: str) -> Finger:
 def to_toml(finger: Finger) -> str:
     """Write a finger as TOML that `from_toml` reads back exactly."""
     tree: dict[str, Any] = msgspec.to_builtins(finger)
-    lines: list[str] = []
-    tables = {key: value for key, value in tree.items() if isinstance(value, dict)}
-    for key, value in tree.items():
-        if not isinstance(value, dict) and value is not None:
-            lines.append(f"{key} = {_toml(value)}")
-    for key, table in tables.items():
-        lines += ["", f"[{key}]"]
-        lines += [f"{name} = {_toml(value)}" for name, value in table.items()]
-    return "\n".join(lines) + "\n"
-
-
-def _toml(value: Any) -> str:
-    match value:
-        case bool():
-            return "true" if value else "false"
-        case str():
-            return msgspec.json.encode(value).decode()  # JSON's escapes are a subset of TOML's basic strings
-        case int() | float():
-            return repr(value)
-        case list() | tuple() if value and isinstance(value[0], list | tuple):
-            return "[\n" + "".join(f"  {_toml(row)},\n" for row in value) + "]"
-        case list() | tuple():
-            return "[" + ", ".join(_toml(item) for item in value) + "]"
-    raise TypeError(f"write finger: no TOML for {type(value).__name__}")
+    return toml_text({key: value for key, value in tree.items() if value is not None})
 
 
 def _numbers(value: Any) -> Iterator[float]:

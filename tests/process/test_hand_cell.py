@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 from daemon_rig import Daemon, raises, wait_for
 
+from sioms.documents import toml_text
 from sioms.hand.live import cell as live
 from sioms.hand.live.cell import CellHand
 from sioms.hand.skills import Skills
-from sioms.hand.slow import slowed, toml
+from sioms.hand.slow import slowed
 from sioms.hand.touch import Manner
 
 ETC = Path(__file__).resolve().parents[2] / "etc"
@@ -34,7 +35,7 @@ def _config(pace: float) -> str:
         devices[side]["axis"][0]["motor"]["start"] = sign * 0.0337
     for finger in ("touch1", "touch2"):
         devices[finger]["shape"]["compiled"] = False  # numba takes seconds to start
-    return toml(slowed(tables, pace, ETC))
+    return toml_text(slowed(tables, pace, ETC))
 
 
 @pytest.mark.timeout(400)

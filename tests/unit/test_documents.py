@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from sioms.daemon.config import parse
-from sioms.documents import DEEPEST, MOST_BYTES, json_of, read_bytes, read_text, toml_of
+from sioms.documents import DEEPEST, MOST_BYTES, json_of, read_bytes, read_text, toml_of, toml_text
 from sioms.drivers.modbus.regmap_files import RegisterMapError, load_map
 from sioms.plant.effects import EffectsError, parse_effects
 from sioms.tactile.finger import from_toml
@@ -97,3 +98,28 @@ def test_readers_of_documents_say_what_is_wrong(tmp_path: Path) -> None:
             from_toml(text)
         with pytest.raises(EffectsError):
             parse_effects(text, ["x"])
+
+
+_TEXTS = st.text(st.characters(codec="utf-8"), max_size=8)
+_VALUES = st.recursive(
+    st.booleans() | st.integers(-(2**63), 2**63 - 1) | st.floats(allow_nan=False) | _TEXTS,
+    lambda below: st.lists(below, max_size=3) | st.dictionaries(_TEXTS, below, max_size=3),
+    max_leaves=12,
+)
+
+
+@given(st.dictionaries(_TEXTS, _VALUES, max_size=4))
+def test_what_is_written_is_read_back_exactly(tables: dict[str, Any]) -> None:
+    assert tomllib.loads(toml_text(tables)) == tables
+
+
+def test_a_device_of_a_configuration_has_a_head_and_so_has_each_of_its_axes() -> None:
+    text = toml_text({"device": {"left": {"axis": [{"name": "x", "watch": {"tolerance": 0.1}}], "driver": "sim-axes"}}})
+    assert text == (
+        '[device.left]\ndriver = "sim-axes"\n\n[[device.left.axis]]\nname = "x"\nwatch = { tolerance = 0.1 }\n'
+    )
+
+
+def test_what_no_document_holds_is_not_written() -> None:
+    with pytest.raises(TypeError, match="a NoneType; want a number, a text"):
+        toml_text({"a": None})

@@ -22,12 +22,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Write the configuration."""
-    from sioms.documents import read_bytes, toml_of
-    from sioms.hand.slow import slowed, toml
+    from sioms.documents import read_bytes, toml_of, toml_text
+    from sioms.hand.slow import slowed
 
     try:
         tables = toml_of(read_bytes(args.config))
-        text = toml(slowed(tables, args.pace, args.config.resolve().parent))
+        text = toml_text(slowed(tables, args.pace, args.config.resolve().parent))
         if args.output is None:
             sys.stdout.write(text)
         else:

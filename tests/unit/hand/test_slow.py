@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from hand_cell_rig import HandCell, write
 
+from sioms.documents import toml_text
 from sioms.hand.follow import D
-from sioms.hand.slow import slowed, toml
+from sioms.hand.slow import slowed
 from sioms.motion.law import ControlLaw
 from sioms.motion.settings import AxisSettings, Watch
 from sioms.motion.watch import tolerance_of
@@ -37,14 +38,14 @@ def test_a_device_that_is_not_simulated_is_refused() -> None:
 
 def test_what_is_written_is_what_was_made() -> None:
     tables = slowed(_tables(), 0.25, ETC)
-    assert tomllib.loads(toml(tables)) == tables
+    assert tomllib.loads(toml_text(tables)) == tables
     assert Path(tables["device"]["touch1"]["shape"]["finger_file"]).is_absolute()
     assert tables["device"]["hand"]["pace"] == 0.25 and tables["device"]["left"]["world_age_max_s"] == 0.2
 
 
 def test_one_pace_goes_on_top_of_another() -> None:
     once, twice = slowed(_tables(), 0.125, ETC), slowed(slowed(_tables(), 0.5, ETC), 0.25, ETC)
-    assert toml(once) == toml(twice)  # powers of two are exact
+    assert toml_text(once) == toml_text(twice)  # powers of two are exact
 
 
 @pytest.mark.parametrize("pace", [0.3, 0.1])
@@ -87,3 +88,26 @@ def test_slow_motion_is_the_same_motion() -> None:
     way = np.abs(whole - whole[0]).max()
     assert way > 0.1 and np.abs(whole[-1, -3:] - whole[0, -3:]).max() > 1e-3  # it was met, and moved
     assert np.abs(whole - half).max() < 0.02 * way
+
+
+@pytest.mark.parametrize(
+    ("tables", "says"),
+    [
+        ({"a": 1}, "slow cell: a = 1; want a table"),
+        ({"device": 1}, "slow cell: device = 1; want a table"),
+        ({"device": {"left": [1]}}, r"slow cell: device\.left = \[1\]; want a table"),
+        ({"device": {"left": {"driver": "sim-axes", "axis": [{"velocity_max": "1"}]}}}, 'velocity_max = "1"; want a n'),
+        ({"device": {"left": {"driver": "sim-axes", "axis": [{"motor": 1}]}}}, "motor = 1; want a table"),
+        ({"device": {"left": {"driver": "sim-axes", "axis": [{"watch": 1}]}}}, "watch = 1; want a table"),
+    ],
+)
+def test_what_is_no_configuration_is_refused(tables: dict[str, Any], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        slowed(tables, 0.5, ETC)
+
+
+def test_alarms_and_rights_stay() -> None:
+    tables = _tables()
+    tables["grant"] = [{"users": ["eva"], "nodes": ["*"], "rights": ["read"]}]
+    tables["alarm"] = [{"node": "left", "high": 1.0}, {"node": "right", "high": 2.0}]
+    assert tomllib.loads(toml_text(slowed(tables, 0.5, ETC)))["alarm"] == tables["alarm"]
