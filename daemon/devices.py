@@ -93,7 +93,7 @@ class DriverProcess:
         self.info = info
         self.state = State.DOWN
         self.reason = ""
-        self.trouble = ""
+        self.trouble, self._trouble_ns, self._fault_ns = "", 0, 0
         self.link: tuple[PageState, str] = (PageState.STARTING, "")
         self.generation = 0
         self.pid = 0
@@ -434,14 +434,28 @@ class DriverProcess:
             self._when_gone(self._ended)
             return
         again_ns = self.restarts.died(time.monotonic_ns())
-        self.state = State.FAULT if again_ns is None else State.RESTARTING
+        self.state, self._fault_ns = State.FAULT if again_ns is None else State.RESTARTING, time.monotonic_ns()
         self._log("error", "device lost", device=self.name, reason=reason, then=self.state.value)
         self._owner.device_gone(self, reason)
         if again_ns is not None:
             self._timer = self._loop.at(again_ns, self.start)
 
-    def reset(self) -> None:
-        """Start a device in fault again, with a clean record."""
-        if self.state is State.FAULT:
+    def note_trouble(self, text: str) -> None:
+        """Keep for the status what its driver reports as an error."""
+        self.trouble, self._trouble_ns = text, time.monotonic_ns()
+
+    def has_failed_since(self, instant_ns: int) -> bool:
+        """Return whether it is in fault since after an instant [ns, CLOCK_MONOTONIC]."""
+        return self.state is State.FAULT and self._fault_ns > instant_ns
+
+    def reset(self, sent_ns: int) -> None:
+        """Forget its trouble, and start it again, with a clean record, if it is in fault; but for what came later.
+
+        Args:
+            sent_ns: when the reset was sent, at the earliest [ns, CLOCK_MONOTONIC].
+        """
+        if self._trouble_ns <= sent_ns:
+            self.trouble = ""
+        if self.state is State.FAULT and not self.has_failed_since(sent_ns):
             self.restarts.forget()
             self.start()

@@ -128,7 +128,7 @@ class Processes:
                 self._holds.silent(device, name, why)
             case driver_verbs.LogLine(level, text):
                 if text.startswith("fault of "):
-                    device.trouble = text
+                    device.note_trouble(text)
                 self._cell.log(level, "driver", device=device.name, text=text)
             case _:
                 raise NotImplementedError(f"{type(message).__name__} is not served")

@@ -39,7 +39,7 @@ class StopVerbs:
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""
-        name, why = message
+        name, why, or_all = message
         source = f"{session}" + (f": {printable(why, 80)}" if why else "")
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
@@ -49,7 +49,16 @@ class StopVerbs:
                 )
             self._stops.stop_for(session.peer.pid, source, session.number)
             return
-        node = self._nodes.find(session, "emergency stop", name, message.right)
+        try:
+            node = self._nodes.find(session, "emergency stop", name, message.right)
+        except Refused as error:
+            if error.errno != errno.ENOENT or not or_all:
+                raise
+            if not self._clients.rights.on_workcell(session.peer) & message.right:
+                raise
+            missing = f"{source} (of {printable(name, 80)}, which there is not)"
+            self._stops.stop_for(session.peer.pid, missing, session.number)
+            raise Refused(errno.ENOENT, f"{error}; the whole workcell has been stopped instead") from None
         try:
             self._stops.stop_node(node, source, session.number)
         except OSError as error:
@@ -96,7 +105,11 @@ class StopVerbs:
         node = self._nodes.find(session, "reset", name, message.right)
         device = self._cell.devices.get(node.device)
         if device is not None and device.state is State.FAULT:
-            device.reset()
+            sent_ns = self._sent_ns(session, said_ns)
+            if device.has_failed_since(sent_ns):
+                why = f"{device.name} has failed after this was sent ({device.reason})"
+                raise Refused(errno.EAGAIN, f"reset {name}: {why}; see why, and reset again")
+            device.reset(sent_ns)
             self._cell.log("info", "reset", node=node.name, device=device.name, by=session)
             return
         latch = self._cell.shared.latch
@@ -110,4 +123,4 @@ class StopVerbs:
         except OSError as error:
             raise Refused(errno.EIO, f"reset {name}: {error.strerror}") from None
         if device is not None:
-            device.trouble = ""
+            device.reset(sent_ns)

@@ -121,9 +121,8 @@ class Stops:
         self._shared.latch.reset(time.monotonic_ns(), self._request_seen, sent_ns)
         self._cell.log("warning", "reset", by=who)
         for device in self._cell.devices.values():
-            device.trouble = ""
             device.tell(driver_verbs.StopChanged())
-            device.reset()
+            device.reset(sent_ns)
         for device in self._cell.devices.values():
             self.look_at_inputs(device)  # as one that is still pressed, it stops the workcell again
 

@@ -234,13 +234,13 @@ class Cell:
         return self._ask(c, ClientVerb.CLOSE, self.clients[c].numbers[d])
 
     def stop(self, c: int) -> str:
-        return self._ask(c, ClientVerb.EMERGENCY_STOP, "", "")
+        return self._ask(c, ClientVerb.EMERGENCY_STOP, "", "", False)
 
     def reset(self, c: int) -> str:
         return self._ask(c, ClientVerb.RESET, "")
 
     def stop_node(self, c: int, d: int) -> str:
-        return self._order(c, d, ClientVerb.EMERGENCY_STOP, NAMES[d], "")
+        return self._order(c, d, ClientVerb.EMERGENCY_STOP, NAMES[d], "", False)
 
     def reset_node(self, c: int, d: int) -> str:
         return self._order(c, d, ClientVerb.RESET, NAMES[d])
@@ -270,7 +270,7 @@ class Cell:
         if client.sock is not None:
             self.dead[c] = client
             if words == 3:
-                client.ask(ClientVerb.EMERGENCY_STOP, "", "")
+                client.ask(ClientVerb.EMERGENCY_STOP, "", "", False)
             elif words:
                 client.ask(ClientVerb.OPEN, NAMES[words - 1], 3, None, LEASE_S)
         client.end()

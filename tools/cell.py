@@ -12,6 +12,7 @@ from typing import Any
 
 from sioms.arguments import positive
 from sioms.client.stopping import emergency_stop
+from sioms.client.undisturbed import Undisturbed
 from sioms.client.workcell import NodeEntry, Workcell, is_part
 from sioms.protocol.flags import READONLY, ControlMode, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
@@ -118,7 +119,7 @@ def _wait(timeout_s: float) -> None:
 def _stop(nodes: Sequence[str]) -> None:
     if nodes:
         failed: list[OSError] = []
-        with Workcell(name="sioms") as cell:
+        with Workcell(name="sioms") as cell, Undisturbed():
             for node in nodes:
                 try:
                     cell.emergency_stop(node, "sioms stop")

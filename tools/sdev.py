@@ -80,14 +80,19 @@ def _check(line: Line) -> None:
 
 def _stop(cell: Workcell, line: Line) -> None:
     """Carry out the emergency stops, which overtake everything else on the command line."""
-    for target in line.targets:
-        if "e" in target.flags:
+    words = [target.name for target in line.targets if "e" in target.flags]
+    if not words:
+        return
+    from sioms.client.undisturbed import Undisturbed
+
+    with Undisturbed():  # an interrupt between two attempts would leave it at none
+        for word in words:
             try:
                 by_any_name(
-                    target.name, lambda name: cell.emergency_stop(name.removesuffix(READONLY), "sdev -e", or_all=False)
+                    word, lambda name: cell.emergency_stop(name.removesuffix(READONLY), "sdev -e", or_all=False)
                 )
             except FileNotFoundError:  # by none of its names
-                cell.emergency_stop(target.name, "sdev -e")
+                cell.emergency_stop(word, "sdev -e")
 
 
 class Setter:

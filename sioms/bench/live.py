@@ -307,7 +307,7 @@ def _client_message(generator: random.Random) -> bytes:
         [ClientVerb.FREE_MARKER, number, generator.getrandbits(50)],
         [ClientVerb.SIGNAL_MARKER, number, generator.getrandbits(50)],
         [ClientVerb.WAIT_MARKER, number, generator.randint(0, 2000), 0.0],
-        [ClientVerb.EMERGENCY_STOP, number, generator.choice(("", "mod0", "x")), "fuzz"],
+        [ClientVerb.EMERGENCY_STOP, number, generator.choice(("", "mod0", "x")), "fuzz", generator.random() < 0.5],
         [ClientVerb.RESET, number, generator.choice(("", "mod1"))],
         [ClientVerb.CANCEL, number, generator.randint(0, 9)],
     ]

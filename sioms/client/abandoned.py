@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from errno import ENOENT
-
-from sioms.protocol.verbs import Close, EmergencyStop, FreeMarker, Open, ReserveMarker
+from sioms.protocol.verbs import Close, FreeMarker, Open, ReserveMarker
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -22,10 +20,6 @@ def undoing(abandoned: Message | None, refused: int, value: Any) -> Sequence[Mes
         refused: the errno of its answer, 0: it was carried out.
         value: of its answer.
     """
-    if isinstance(abandoned, EmergencyStop) and abandoned.node and refused == ENOENT:  # by a wrong name: see 0991
-        return (
-            EmergencyStop("", f"{abandoned.why}{' ' * bool(abandoned.why)}(of {abandoned.node}, which there is not)"),
-        )
     if refused:
         return ()
     if isinstance(abandoned, Open):

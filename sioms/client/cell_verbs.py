@@ -334,20 +334,10 @@ class WorkcellVerbs(Session[M]):
         Raises:
             OSError: ENOENT there is no such node; the sentence says whether all has been stopped.
         """
-        try:
-            await self._stop(node, why)
-        except FileNotFoundError as error:
-            if not (node and or_all):
-                raise
-            try:
-                await self._stop("", f"{why}{' ' * bool(why)}(of {node}, which there is not)")
-            except OSError:
-                raise error from None  # without the right to stop all
-            text = f"{error.strerror}; the whole workcell has been stopped instead"
-            raise OSError(error.errno, text) from None
+        await self._stop(node, why, or_all)
 
-    async def _stop(self, node: str, why: str) -> None:
-        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why))))
+    async def _stop(self, node: str, why: str, or_all: bool = False) -> None:
+        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why)), or_all))
         taken = call.enough = request_stop(None if node else self._request, printable(str(why)))
         try:
             await self._waiter.call(call)

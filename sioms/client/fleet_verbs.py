@@ -300,7 +300,7 @@ class FleetVerbs(Generic[C]):
         with self._together.undisturbed() as undisturbed:
             try:
                 for cell in self.cells.values():
-                    call = Call("emergency stop", verbs.EmergencyStop("", why))
+                    call = Call("emergency stop", verbs.EmergencyStop("", why, False))
                     call.enough = request_stop(cell._request, why)
                     calls.append((cell, call))
                 answers = await self._together.calls(calls, undisturbed.end)
@@ -323,7 +323,7 @@ class FleetVerbs(Generic[C]):
     def _stop_unasked(self, why: str) -> None:
         """Tell all cells to stop, without waiting for their answers; a second time does no harm."""
         for cell in self.cells.values():
-            call = Call("emergency stop", verbs.EmergencyStop("", why))
+            call = Call("emergency stop", verbs.EmergencyStop("", why, False))
             with suppress(OSError):
                 request_stop(cell._request, why)
                 cell._channel.send(call)

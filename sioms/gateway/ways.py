@@ -143,7 +143,8 @@ class Ways:
                     self._drop(who, way)
                 if way is not None and not attempt:
                     continue
-                return refusal(number, error.errno or errno.EIO, error.strerror or str(error))
+                text = error.strerror or str(error)
+                return refusal(number, error.errno or errno.EIO, text, time.monotonic_ns())  # it may have stopped more
         raise AssertionError("two attempts")
 
     def _way(self, who: Principal, host: str) -> Way:

@@ -303,6 +303,18 @@ class Bank(ABC):
         """Tell whether an axis is stopped by an emergency stop or in fault, until ``reset``."""
         return bool(self._queue.latched.item(axis) & (EMERGENCY_STOP | FAULT))
 
+    def is_stopped(self, axis: int) -> bool:
+        """Tell whether an axis is under an emergency stop, until ``reset``."""
+        return bool(self._queue.latched.item(axis) & EMERGENCY_STOP)
+
+    def is_in_fault(self, axis: int) -> bool:
+        """Tell whether an axis is in fault, until ``reset``."""
+        return bool(self._queue.latched.item(axis) & FAULT)
+
+    def take_faults(self) -> list[int]:
+        """Return the axes that have come into fault since the last call; cheap where none has."""
+        return self._queue.take_faults()
+
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""
         return self._queue.fault_text(axis)
@@ -329,6 +341,12 @@ class Bank(ABC):
         latched = self._queue.latched[chosen]
         self._queue.unlatch(chosen)
         self._recover(chosen, latched)
+        self._show(chosen)
+
+    def end_stop(self, axes: AxesLike) -> None:
+        """Clear the emergency stop of axes in fault, which stay so."""
+        chosen = np.asarray(axes, dtype=np.int64)
+        self._queue.latched[chosen] &= ~EMERGENCY_STOP
         self._show(chosen)
 
     def forget_settings(self, axes: AxesLike) -> None:

@@ -104,6 +104,7 @@ class CommandQueue:
         self.plain = PlainCheck(self._validator.offered, self.limits)
         self._waiting: dict[tuple[int, int], set[int]] = {}
         self._fault_text: dict[int, str] = {}
+        self._new_faults: list[int] = []
         self._lost_text: dict[int, str] = {}
         self._events: list[tuple[EventKind, Any, int, int, str]] = []
 
@@ -463,7 +464,15 @@ class CommandQueue:
         self.latched_ns[fresh] = now_ns
         for axis in fresh.tolist():
             self._fault_text[axis] = text
+        self._new_faults += fresh.tolist()
         self.emit(EventKind.FAULT, fresh, now_ns, errno_, text)
+
+    def take_faults(self) -> list[int]:
+        """Return the axes that have come into fault, or lost their place, since the last call; cheap where none has."""
+        faults = self._new_faults
+        if faults:
+            self._new_faults = []
+        return faults
 
     def fault_text(self, axis: int) -> str:
         """Return why an axis is in fault, empty when it is not."""
@@ -473,6 +482,7 @@ class CommandQueue:
         """Latch that these axes do not know where they are, with the reason; only find_places() clears it."""
         self.latched[axes] = self.latched[axes] & ~HOMED | LOST
         reason = dict.fromkeys(axes.tolist(), text)
+        self._new_faults += reason
         self._lost_text.update(reason)
         self._fault_text.update(reason)  # outweighs an earlier one, such as the lost link that led to it
         self._limits_set += 1  # what was judged before is judged again

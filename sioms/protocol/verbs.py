@@ -309,10 +309,13 @@ class WaitMarker(Message, on=FROM_CLIENT, verb=ClientVerb.WAIT_MARKER, somewhere
 class EmergencyStop(
     Message, on=FROM_CLIENT, verb=ClientVerb.EMERGENCY_STOP, right=Right.STOP, shown=True
 ):  # fmt: skip
-    """Stop a node, '' = the workcell, until it is reset. For the workcell, the right on any one node is sufficient."""
+    """Stop a node, '' = the workcell, until it is reset. For the workcell, the right on any one node is sufficient.
+    `or_all`: if there is no such node, the workcell is stopped, and the request is then refused.
+    """
 
     node: Name
     why: Text
+    or_all: Flag
 
 
 class Supervise(Message, on=FROM_CLIENT, verb=ClientVerb.SUPERVISE, right=Right.STOP):

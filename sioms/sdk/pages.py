@@ -35,6 +35,7 @@ class Pages:
 
     Attributes:
         fds: descriptors of the pages in the order of the blocks, until they have been handed over.
+        before: called before each publication.
         watch: called with each block that has been published, and its time stamp [ns]; None: nobody watches.
     """
 
@@ -43,6 +44,7 @@ class Pages:
         told: Callable[[Sequence[AnyBlock], PageState, str], None],
     ) -> None:  # fmt: skip
         self._told = told
+        self.before: Callable[[], None] = lambda: None
         self.watch: Callable[[AnyBlock, int], None] | None = None
         self.fds: list[int] = []
         self._writers: dict[int, PageWriter] = {}
@@ -72,6 +74,7 @@ class Pages:
     def publish(self, block: AnyBlock, stamp_ns: int, tick: int, as_of_ns: int) -> None:
         """Publish a block and wake who subscribed to it."""
         key = id(block)
+        self.before()
         self._writers[key].publish(block.payload(), stamp_ns, tick, as_of_ns)
         subscribers = self._subscribers[key]
         if subscribers:

@@ -131,6 +131,7 @@ class Runtime:
             self.latch, request, StopJournal(fds[5]), options["stop_sources"],
             self.journal,
         )  # fmt: skip
+        self.pages.before = self.stops.note_faults
         self.alarms = AlarmWatch(self.blocks, options["alarms"], self.tell, self.stops.stop_by_alarm)
         self.pages.watch = self.alarms.look if options["alarms"] else None
         parts = Parts(self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log)

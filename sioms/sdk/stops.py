@@ -91,6 +91,7 @@ class Stops:
         stopped: whether the workcell is stopped.
         resets: when what was stopped was reset.
         asked: when somebody asked for the stop of a node, stopped already or not.
+        faults: when axes came into fault, as far as anybody can have seen it.
         latched_outputs: parts of outputs (block, channel, bit) under an emergency stop of their node, and by whom; bit
             0 for channels without bits.
     """
@@ -104,12 +105,13 @@ class Stops:
         events: JournalWriter,
     ) -> None:  # fmt: skip
         self.stopped = False
-        self.resets, self.asked = PartTimes(), PartTimes()
+        self.resets, self.asked, self.faults = PartTimes(), PartTimes(), PartTimes()
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._faulty: set[tuple[int, int]] = set()
         self._unsafe: dict[int, tuple[int, int]] = {}
         """Blocks with safe values that could not be set: when that was logged, and failures since."""
         self._device, self._blocks = device, blocks
+        self._axes = [block for block in blocks if isinstance(block, AxisBlock)]
         self._outputs, self._effects, self._waits, self._pages = outputs, effects, waits, pages
         self._handles = handles
         self._log, self._tell = log, tell
@@ -206,14 +208,34 @@ class Stops:
                 self._reset_with_workcell(block)
 
     def _reset_with_workcell(self, block: AnyBlock) -> None:
-        """Clear the stops of a block, but for those that were asked for after the reset of the workcell was."""
+        """Clear the stops and faults of a block, but for those that came after the reset of the workcell was sent."""
+        sent_ns = self._latch.reset_sent_ns
         stopped = self._stopped_of(block, range(block.n), -1)
-        younger = self.asked.since(id(block), self._latch.reset_sent_ns)
+        younger = self.asked.since(id(block), sent_ns)
         kept = [part for part in stopped if part in younger]
         if kept:
             self._note_still(block, kept, "a stop that came during the reset of the workcell")
-        everything = [(axis, 0) for axis in range(block.n)] if isinstance(block, AxisBlock) else stopped
-        self._clear(block, [part for part in everything if part not in kept])
+        if isinstance(block, AxisBlock):
+            stopped = [(axis, 0) for axis in range(block.n)]
+            unseen = [axis for axis in self._unseen_faults(block, range(block.n), sent_ns) if (axis, 0) not in kept]
+            if unseen:
+                self._log("warning", f"{self._name(block)} stays in fault: it came during the reset of the workcell")
+                block.bank.end_stop(unseen)
+                kept += [(axis, 0) for axis in unseen]
+        self._clear(block, [part for part in stopped if part not in kept])
+
+    def note_faults(self) -> None:
+        """Note that axes have come into fault, before anybody can see it; cheap where none has."""
+        for block in self._axes:
+            fresh = block.bank.take_faults()
+            if fresh:
+                self.faults.note(id(block), [(axis, 0) for axis in fresh], time.monotonic_ns())
+
+    def _unseen_faults(self, block: AxisBlock, channels: Iterable[int], sent_ns: int) -> list[int]:
+        """Return the axes whose faults nobody can have seen who sent something at an instant [ns, CLOCK_MONOTONIC]."""
+        self.note_faults()
+        later = self.faults.since(id(block), sent_ns)
+        return [int(axis) for axis in channels if (int(axis), 0) in later and block.bank.is_in_fault(int(axis))]
 
     def _note_workcell_reset(self, seen_stop_ns: int) -> bool:
         """Note that the workcell has been reset; return whether that has ended a stop that was not seen."""
@@ -310,9 +332,8 @@ class Stops:
 
     def take_events(self) -> None:
         """End the waits that events of the axes end, and report faults."""
-        for block in self._blocks:
-            if not isinstance(block, AxisBlock):
-                continue
+        self.note_faults()
+        for block in self._axes:
             for event in block.bank.take_events():
                 if event.kind in (EventKind.DROPPED, EventKind.FAULT):
                     self._effects.note()
@@ -404,8 +425,10 @@ class Stops:
         try:
             self.check_reset(block, channels, bit, what, sent_ns, until_ns, by)
         except OSError:
-            if stopped:
-                self._note_still(block, stopped, "a stop that came during a reset")
+            # A fault is no stop that outlives this process.
+            still = [part for part in stopped if not isinstance(block, AxisBlock) or block.bank.is_stopped(part[0])]
+            if still:
+                self._note_still(block, still, "a stop or fault that came during a reset")
             raise
         self._effects.note()
         self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
@@ -436,14 +459,20 @@ class Stops:
 
         Raises:
             OSError: EPERM, the whole workcell is stopped; EAGAIN, somebody else has stopped one of them since it was
-                sent, or it was stopped at until_ns or later.
+                sent, or it has come into fault since, or either was so at until_ns or later.
         """
         if self.stopped:
             raise OSError(errno.EPERM, f"{what}: the whole workcell is stopped ({self.source}); reset that")
         masks = dict.fromkeys(map(int, channels), 1 << bit if bit >= 0 else -1)
         if sent_ns < self.asked.latest_ns(id(block), masks, by):
             raise OSError(errno.EAGAIN, f"{what}: stopped after this was sent; see why, and reset again")
-        if isinstance(block, AxisBlock) and until_ns is not None:
+        if not isinstance(block, AxisBlock):
+            return
+        for axis in self._unseen_faults(block, channels, sent_ns):
+            name, why = block.spec.channels[axis].name, block.bank.fault_text(axis)
+            text = f"{what}: {name} has come into fault after this was sent ({why}); see why, and reset again"
+            raise OSError(errno.EAGAIN, text)
+        if until_ns is not None:
             try:
                 block.bank.check_reset(channels, until_ns)
             except CommandError as error:

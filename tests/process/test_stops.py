@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
 import signal
@@ -14,10 +15,13 @@ from pathlib import Path
 
 import pytest
 from daemon_rig import WORKCELL, Client, Daemon, Waiting, at_rest, has_ended, jog, raises, wait_for
+from interrupt_rig import interrupted_everywhere
 
 import sioms
 import sioms.aio
+from sioms.client.channel import Call
 from sioms.client.stopping import emergency_stop
+from sioms.protocol import verbs
 from sioms.protocol.flags import AxisStatus, Request
 
 
@@ -380,3 +384,60 @@ def test_stop_needs_no_ownership(daemon: Daemon, cell: sioms.Workcell, client: C
     with cell.open("mod0.xaxis.readonly") as seen:
         seen.ioctl(Request.STOP)
         at_rest(seen, 2.0)
+
+
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
+def test_a_stop_by_a_wrong_name_that_is_interrupted_stops_all_or_has_not_been_sent(
+    daemon: Daemon, cell: sioms.Workcell
+) -> None:
+    modules = ("sioms.client.cell_verbs", "sioms.client.channel", "sioms.client.faces")
+    stopped = []
+
+    def stop() -> None:
+        with contextlib.suppress(FileNotFoundError):
+            cell.emergency_stop("mod0.xaxsi")
+
+    for _ in interrupted_everywhere(stop, modules):
+        stopped.append(bool(cell.status()["stopped_ns"]))
+        cell.reset()
+    assert sum(stopped) > 5 and stopped == sorted(stopped), stopped
+    cell.reset()
+
+
+def test_a_client_that_dies_behind_a_stop_by_a_wrong_name_has_stopped_all(daemon: Daemon, cell: sioms.Workcell) -> None:
+    with daemon.cell("doomed") as doomed, daemon.frozen(daemon.pid):
+        doomed._channel.send(Call("stop", verbs.EmergencyStop("mod0.xaxsi", "", True)))
+    wait_for(lambda: cell.status()["stopped_ns"], "stopped")
+    assert "of mod0.xaxsi, which there is not" in cell.status()["stop_source"]
+    cell.reset()
+
+
+@pytest.mark.parametrize("line", ["sioms stop mod0 mod1", "sdev -e /mod0 -e /mod1"])
+def test_a_stop_of_several_nodes_that_is_interrupted_goes_through(
+    daemon: Daemon, cell: sioms.Workcell, line: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from sioms.tools import cell as cell_tool
+    from sioms.tools import options, sdev
+
+    monkeypatch.setenv("SIOMS_SOCKET", daemon.socket)
+    tool, *words = line.split()
+
+    def stop() -> None:
+        if tool == "sioms":
+            cell_tool._stop(words[1:])
+        else:
+            with daemon.cell("sdev") as own:
+                sdev._stop(own, options.fold("sdev", words))
+
+    stopped = []
+    modules = ("sioms.tools.cell", "sioms.tools.sdev", "sioms.tools.pipe")
+    for _ in interrupted_everywhere(stop, modules, is_signal=True):
+        with cell.open("mod0.readonly") as first, cell.open("mod1.readonly") as second:
+            found = {bool(each.read().status[0] & AxisStatus.EMERGENCY_STOP) for each in (first, second)}
+        assert len(found) == 1
+        stopped.append(found.pop())
+        for name in ("mod0", "mod1"):
+            cell.reset(name)
+    assert any(stopped) and stopped == sorted(stopped), stopped
+    for name in ("mod0", "mod1"):
+        cell.reset(name)

@@ -6,6 +6,7 @@ import errno
 import fnmatch
 import os
 import socket
+import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
 from typing import Any
@@ -48,6 +49,7 @@ class Device:
         self.restarts = SimpleNamespace(deaths_ns=[])
         self.link, self.started_ns = (SimpleNamespace(name="GOOD"), ""), 0
         self.orders: list[Message] = []
+        self.failed_ns = self.reset_ns = 0
 
     @property
     def is_there(self) -> bool:
@@ -60,6 +62,12 @@ class Device:
 
     def tell_use(self, used: bool) -> None:
         """Nothing: no device reads another here."""
+
+    def has_failed_since(self, instant_ns: int) -> bool:
+        return self.state is State.FAULT and self.failed_ns > instant_ns
+
+    def reset(self, sent_ns: int) -> None:
+        self.reset_ns = sent_ns
 
     def ended(self) -> list[Detach]:
         return [order for order in self.orders if isinstance(order, Detach)]
@@ -181,14 +189,14 @@ ON_NODES: dict[str, tuple[Callable[[Workcell, str], int | None], list[Right]]] =
     "open": (lambda c, node: c.open("eva", node), [Right.READ, Right.WRITE]),
     "observe": (lambda c, node: c.open("eva", f"{node}.readonly"), [Right.READ]),
     "info": (lambda c, node: c.ask("eva", ClientVerb.INFO, node), [Right.READ]),
-    "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, ""), [Right.STOP]),
+    "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, "", False), [Right.STOP]),
     "reset": (lambda c, node: c.ask("eva", ClientVerb.RESET, node), [EITHER]),
     "acknowledge": (lambda c, node: c.ask("eva", ClientVerb.ACKNOWLEDGE, node, ""), [EITHER]),
     "tell": (lambda c, node: c.ask("eva", ClientVerb.TELL_ALARM, node, "drift", 1, "worn"), [EITHER]),
 }
 """What is asked for on a node, and the rights that it takes: one of each entry."""
 ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
-    "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", ""), Right.STOP),
+    "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", "", False), Right.STOP),
     "reset": (lambda c: c.ask("eva", ClientVerb.RESET, ""), EITHER),
     "supervise": (lambda c: c.ask("eva", ClientVerb.SUPERVISE, 0.5), Right.STOP),
     "reload": (lambda c: c.ask("eva", ClientVerb.RELOAD), Right.ADMINISTER),
@@ -244,6 +252,24 @@ def test_a_verb_on_a_node_takes_its_right_on_that_node(cell: Workcell, rights: l
             assert may or answer in (errno.EPERM, errno.EACCES), (name, node, answer)
             for number in list(cell.sessions["eva"].handles):
                 cell.detached(number)
+
+
+def test_a_stop_by_a_wrong_name_stops_all_for_who_may_and_asks_for_it(cell: Workcell) -> None:
+    for rights, or_all, wanted in ((["stop"], True, ["stop"]), (["stop"], False, []), (["read"], True, [])):
+        cell.grant((rights, "eva", "io0"))
+        cell.done.clear()
+        assert cell.ask("eva", ClientVerb.EMERGENCY_STOP, "io9", "it burns", or_all) == errno.ENOENT
+        assert cell.done == wanted
+        assert cell.value.endswith("; the whole workcell has been stopped instead") is bool(wanted), cell.value
+
+
+def test_a_reset_leaves_a_device_that_has_failed_after_it_was_sent(cell: Workcell) -> None:
+    cell.grant((["write"], "eva", "*"))
+    cell.device.state, cell.device.failed_ns = State.FAULT, 5
+    assert cell.ask("eva", ClientVerb.RESET, "io0") == errno.EAGAIN and not cell.device.reset_ns
+    assert "io0 has failed after this was sent" in cell.value
+    cell.sessions["eva"].timestamp_ns = time.time_ns()
+    assert cell.ask("eva", ClientVerb.RESET, "io0") == 0 and cell.device.reset_ns > 5
 
 
 @pytest.mark.parametrize("rights", SUBSETS, ids="+".join)

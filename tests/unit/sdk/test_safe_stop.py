@@ -27,7 +27,7 @@ class Device:
         self.told: list[str] = []
         self.failing = failing
         verbs = {verb: self.note(verb) for verb in ("stop", "emergency_stop", "fault")}
-        bank: Any = SimpleNamespace(**verbs, take_events=lambda: self.note("events")() or [])
+        bank: Any = SimpleNamespace(**verbs, take_events=lambda: self.note("events")() or [], take_faults=list)
         axes = tuple(ChannelInfo(name, "m") for name in "xy")
         port = (ChannelInfo("o", "", width=4),)
         self.axes = AxisBlock(BlockSpec("", NodeClass.AXIS, axes), bank)

@@ -6,6 +6,7 @@ import errno
 import os
 import random
 from collections.abc import Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -123,9 +124,100 @@ def test_a_reset_of_what_was_not_stopped_is_in_nobodys_way(axes: World) -> None:
 def test_an_axis_in_fault_that_is_reset_counts_as_stopped(axes: World) -> None:
     owner = Sender(axes, axes.open(0, [0], exclusive=True))
     owner.jog()
-    axes.runtime.blocks[0].bank.fault([0], "it jams", CLOCK())  # type: ignore[attr-defined]
+    _fault(axes)
     _order(axes, DriverVerb.NODE_RESET, [0])
     assert owner.served() == [errno.ECANCELED]
+
+
+def _fault(world: World, axis: int = 0) -> None:
+    """Put an axis in fault, and let everybody see it."""
+    CLOCK.now_ns += LATER_NS
+    world.runtime.blocks[0].bank.fault([axis], "it jams", CLOCK() - LATER_NS)  # type: ignore[attr-defined]
+    world.runtime.publish(world.runtime.blocks[0], CLOCK())
+
+
+def _in_fault(world: World, axis: int = 0) -> bool:
+    return bool(world.runtime.blocks[0].bank.is_in_fault(axis))  # type: ignore[attr-defined]
+
+
+def test_a_reset_on_a_handle_that_was_sent_before_a_fault_leaves_it(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0, 1], exclusive=True))
+    owner.reset()
+    _fault(axes)
+    assert owner.served() == [errno.EAGAIN] and "it jams" in str(owner.answers[0])
+    assert _in_fault(axes)
+    owner.reset()
+    assert owner.served()[1:] == [None] and not _in_fault(axes)
+
+
+def test_a_fault_that_nobody_can_have_seen_is_younger_than_any_reset(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    axes.runtime.blocks[0].bank.fault([0], "it jams", CLOCK())  # type: ignore[attr-defined]
+    owner.reset()  # neither a reading nor an answer has told of it
+    assert owner.served() == [errno.EAGAIN] and _in_fault(axes)
+
+
+def test_a_refusal_tells_of_a_fault_as_a_reading_does(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    axes.runtime.blocks[0].bank.fault([0], "it jams", CLOCK())  # type: ignore[attr-defined]
+    owner.jog()
+    assert owner.served() == [errno.EIO]
+    owner.reset()
+    assert owner.served()[1:] == [None] and not _in_fault(axes)
+
+
+def test_a_reset_by_the_daemon_that_was_sent_before_a_fault_leaves_it(axes: World, tmp_path: Any) -> None:
+    sent_ns = CLOCK()
+    _fault(axes)
+    axes.order(DriverVerb.NODE_RESET, 0, [0, 1], -1, "eva", axes.latch.resets, CLOCK(), sent_ns)
+    axes.runtime.heed()
+    assert _in_fault(axes)
+    _order(axes, DriverVerb.NODE_RESET, [0, 1])
+    axes.runtime.heed()
+    assert not _in_fault(axes)
+
+
+def test_a_reset_of_the_workcell_ends_its_stop_and_leaves_faults_that_came_since(axes: World) -> None:
+    bank: Any = axes.runtime.blocks[0].bank  # type: ignore[attr-defined]
+    axes.latch.stop(CLOCK(), "eva")
+    axes.runtime.heed()
+    _fault(axes, 1)
+    CLOCK.now_ns += LATER_NS
+    sent_ns = CLOCK()
+    _fault(axes, 0)
+    axes.latch.reset(CLOCK(), sent_ns=sent_ns)
+    axes.runtime.heed()
+    assert _in_fault(axes, 0) and not bank.is_stopped(0)
+    assert not bank.is_latched(1)
+    CLOCK.now_ns += LATER_NS
+    axes.latch.reset(CLOCK())
+    axes.runtime.heed()
+    assert not bank.is_latched(0)
+
+
+def test_a_fault_that_a_later_reset_has_cleared_is_in_no_earlier_ones_way(axes: World) -> None:
+    owner, eva = (Sender(axes, axes.open(0, [0], exclusive=exclusive)) for exclusive in (True, False))
+    owner.reset()
+    _fault(axes)
+    eva.reset()
+    assert eva.served() == [None] and owner.served() == [None]
+
+
+def test_a_fault_is_not_noted_as_a_stop_when_its_reset_is_refused(axes: World) -> None:
+    noted: list[Any] = []
+    axes.runtime.stops._journal = SimpleNamespace(append=lambda entry, _: noted.append(entry))  # type: ignore[assignment]
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    owner.reset()
+    heed = axes.runtime.heed
+
+    def fault_meanwhile() -> None:
+        heed()
+        if noted and not _in_fault(axes):
+            _fault(axes)
+
+    axes.runtime.heed = fault_meanwhile  # type: ignore[method-assign]
+    assert owner.served() == [errno.EAGAIN] and _in_fault(axes)
+    assert [entry["stop"] for entry in noted] == [False]
 
 
 def test_what_a_client_sends_behind_its_own_reset_is_taken(axes: World) -> None:
