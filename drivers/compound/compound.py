@@ -46,6 +46,7 @@ from sioms.sdk.exchange import LinkError
 from sioms.sdk.inputs import NotMeasuredError
 from sioms.sdk.tables import from_table, table_type
 
+from .bounds import check
 from .readings import LATCHED, Past, Reading, Readings
 
 MODES = EVERY_MODE & ~(
@@ -143,24 +144,13 @@ class Compound(TickDriver):
             raise ValueError(f"axis: {', '.join(names) or 'none given'}; want {', '.join(wanted)}, in this order")
         if not settings.axes:
             raise ValueError("axes: none given; want the nodes of the axes that are held")
-        if not 1.0 / settings.tick_hz <= settings.late_max_s < math.inf:
-            raise ValueError(
-                f"late_max_s {settings.late_max_s:g}; want at least a tick, {1 / settings.tick_hz:g} s, finite"
-            )
+        check(settings)
         for axis in settings.axis:
-            if not (math.isfinite(axis.force_scale) and axis.force_scale):
-                raise ValueError(f"axis {axis.name}: force_scale {axis.force_scale:g}; want a finite number, not 0")
-            if not 0.0 < axis.gain <= 0.5 * settings.tick_hz:
-                raise ValueError(
-                    f"axis {axis.name}: gain {axis.gain:g}; want above 0 and at most {0.5 * settings.tick_hz:g}"
-                )
-            if not 0.0 <= axis.damper < math.inf or (axis.damper > 0.0) != bool(axis.force_node):
+            if (axis.damper > 0.0) != bool(axis.force_node):
                 raise ValueError(
                     f"axis {axis.name}: damper {axis.damper:g} with force_node {axis.force_node!r}; want a positive "
                     "number and a node, or neither"
                 )
-            if not 0.0 < axis.force_age_s < math.inf:
-                raise ValueError(f"axis {axis.name}: force_age_s {axis.force_age_s:g}; want a positive number of s")
         for given in _settings(cls, settings):
             assert given.modes
         channels = tuple(

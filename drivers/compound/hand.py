@@ -23,7 +23,7 @@ import msgspec
 from sioms.documents import read_text
 from sioms.hand.control import Controller, Gains
 from sioms.hand.felt import felt, internal_force, wrist_force
-from sioms.hand.kinematics import COORDINATES, LINK_M, UNITS, Hand
+from sioms.hand.kinematics import COORDINATES, LINK_M, LONGEST_M, UNITS, Hand
 from sioms.hand.model import HandModel, model_of
 from sioms.hand.statics import damped_limit, filtered_limit
 from sioms.motion.axis_step import FORCE
@@ -43,6 +43,15 @@ _BEND_S = 0.05
 """Time constant of the bend of a link in its torque, in the hand's own time [s]: a servo that chases its encoder's
 steps does not shake d."""
 _INVALID = int(AnalogStatus.INVALID)
+_BOUNDS = {
+    "link1_m": (1e-3, LONGEST_M), "link2_m": (1e-3, LONGEST_M), "least_m": (1e-6, 1.0),
+    "link_stiffness": (1e-6, math.inf), "pace": (1e-3, 1.0),
+}  # fmt: skip
+_SQUEEZE_BOUNDS = {
+    "length_m": (1e-4, 1.0), "damper": (1e-9, 1e4), "spring_rate": (1e-6, 1e4), "spring": (1e-6, 1e9),
+    "filter_s": (0.0, 1e4), "opening_max": (1e-9, 1e2), "contact_n": (0.0, 1e3), "stiffness": (1e-6, 1e9),
+    "damping": (0.0, 1e6), "age_max_s": (1e-4, 3600.0),
+}  # fmt: skip
 MODEL_CHANNELS = (
     *((f"link{i}", "m", "length of a link") for i in (1, 2)),
     *((f"mount{i}", "rad", "angle by which a finger is turned on its link") for i in (1, 2)),
@@ -137,10 +146,11 @@ class HandDriver(Compound):
     def describe(cls, name: str, settings: HandSettings) -> Description:
         """Tell the coordinates and the force."""
         base = super().describe(name, settings)
+        for key, (least, most) in _BOUNDS.items():
+            if not least <= getattr(settings, key) <= most:
+                raise ValueError(f"{key} {getattr(settings, key):g}; want {least:g} to {most:g}")
         if any(axis.force_node for axis in settings.axis):
             raise ValueError("axis: has a force_node; want the table squeeze, which says from where the force comes")
-        if not 0.0 < settings.pace <= 1.0:
-            raise ValueError(f"pace {settings.pace:g}; want above 0, at most 1")
         model = _spec("model", _model_channels(settings), settings.history)
         squeeze = settings.squeeze
         if squeeze is None:
@@ -339,14 +349,9 @@ def _check(squeeze: SqueezeTable, settings: HandSettings) -> None:
     """
     if (squeeze.fingers is None) == (squeeze.wrists is None):
         raise ValueError("squeeze: has neither or both of fingers and wrists; want one of them")
-    if not 0.0 < squeeze.length_m < math.inf or not 0.0 < squeeze.age_max_s < math.inf:
-        raise ValueError(
-            f"squeeze: length_m {squeeze.length_m:g}, age_max_s {squeeze.age_max_s:g}; want more than 0, finite"
-        )
-    if not 0.0 < squeeze.stiffness < math.inf or not 0.0 <= squeeze.damping < math.inf:
-        raise ValueError(
-            f"squeeze: stiffness {squeeze.stiffness:g}, damping {squeeze.damping:g}; want more than 0, and 0 or more"
-        )
+    for key, (least, most) in _SQUEEZE_BOUNDS.items():
+        if not least <= getattr(squeeze, key) <= most:
+            raise ValueError(f"squeeze: {key} {getattr(squeeze, key):g}; want {least:g} to {most:g}")
     _gains(squeeze, settings)
     sample_s = 1.0 / settings.tick_hz
     limits = damped_limit(squeeze.stiffness, squeeze.damping, sample_s), filtered_limit(squeeze.filter_s, sample_s)

@@ -33,10 +33,10 @@ class Arm:
 
     def __post_init__(self) -> None:
         for name in ("upper_m", "fore_m"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise ValueError(f"describe arm: {name} {getattr(self, name)}; want more than 0, finite")
-        if not 0.0 < self.bend_rad < 0.5 * math.pi:
-            raise ValueError(f"describe arm: bend_rad {self.bend_rad}; want above 0 and below pi/2")
+            if not 1e-3 <= getattr(self, name) <= 1e3:
+                raise ValueError(f"describe arm: {name} {getattr(self, name):g}; want 0.001 to 1000")
+        if not 1e-6 <= self.bend_rad < 0.5 * math.pi:
+            raise ValueError(f"describe arm: bend_rad {self.bend_rad:g}; want 1e-6 or more and below pi/2")
         if not abs(self.facing_rad) <= math.tau:
             raise ValueError(f"describe arm: facing_rad {self.facing_rad}; want an angle within 2 pi")
 

@@ -24,10 +24,10 @@ class Gantry:
     skew_max: float = 0.01
 
     def __post_init__(self) -> None:
-        if not 0.0 < self.span_m < math.inf:
-            raise ValueError(f"describe gantry: span_m {self.span_m}; want more than 0, finite")
-        if not 0.0 < self.skew_max < 0.5 * math.pi:
-            raise ValueError(f"describe gantry: skew_max {self.skew_max} rad; want above 0 and below pi/2")
+        if not 1e-3 <= self.span_m <= 1e3:
+            raise ValueError(f"describe gantry: span_m {self.span_m:g}; want 0.001 to 1000")
+        if not 1e-9 <= self.skew_max < 0.5 * math.pi:
+            raise ValueError(f"describe gantry: skew_max {self.skew_max:g} rad; want 1e-9 or more and below pi/2")
 
     def forward(self, joints: Sequence[float]) -> Three:
         """Return (x, y, skew) of joints; a bridge that is skewed too far still has a skew."""

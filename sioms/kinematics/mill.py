@@ -35,12 +35,12 @@ class Mill:
     def __post_init__(self) -> None:
         for name, count in (("pivot_m", 3), ("table_m", 2)):
             value = getattr(self, name)
-            if len(value) != count or not all(map(math.isfinite, value)):
-                raise ValueError(f"describe mill: {name} {list(value)}; want {count} finite numbers")
-        if not 0.0 <= self.tool_m < math.inf:
-            raise ValueError(f"describe mill: tool_m {self.tool_m}; want 0 or more, finite")
-        if not 0.0 < self.tilt_max <= math.pi:
-            raise ValueError(f"describe mill: tilt_max {self.tilt_max} rad; want above 0 and at most pi")
+            if len(value) != count or not all(abs(number) <= 1e3 for number in value):
+                raise ValueError(f"describe mill: {name} {list(value)}; want {count} numbers within 1000")
+        if not 0.0 <= self.tool_m <= 1e3:
+            raise ValueError(f"describe mill: tool_m {self.tool_m:g}; want 0 to 1000")
+        if not 1e-9 <= self.tilt_max <= math.pi:
+            raise ValueError(f"describe mill: tilt_max {self.tilt_max:g} rad; want 1e-9 or more and at most pi")
 
     def forward(self, joints: Sequence[float]) -> Five:
         """Return (x, y, z, tilt, turn) of joints; a table that is tilted too far still has a place."""

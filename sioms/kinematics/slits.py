@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -20,8 +19,8 @@ class Slits:
     least_m: float = 0.0
 
     def __post_init__(self) -> None:
-        if not 0.0 <= self.least_m < math.inf:
-            raise ValueError(f"describe slits: least_m {self.least_m}; want 0 or more, finite")
+        if not 0.0 <= self.least_m <= 1e3:
+            raise ValueError(f"describe slits: least_m {self.least_m:g}; want 0 to 1000")
 
     def forward(self, joints: Sequence[float]) -> Two:
         """Return (centre, gap) of the blades."""

@@ -153,7 +153,7 @@ def test_a_held_axis_that_came_to_its_own_limit_sooner_than_foreseen_is_the_end_
 
 
 def test_limits_that_cannot_be_are_refused_with_a_sentence() -> None:
-    with pytest.raises(ValueError, match="velocity_max 0; want a positive number"):
+    with pytest.raises(ValueError, match="axis centre: velocity_max 0; want 1e-09 to 10000"):
         Slits(velocity_max=0.0)
 
 

@@ -178,7 +178,7 @@ def test_a_finger_that_dies_stops_the_squeeze_and_says_which(cell: HandCell) -> 
         ({"squeeze": {}}, "neither or both"),
         ({"squeeze": {"fingers": ["a", "b"], "wrists": ["c", "d"]}}, "neither or both"),
         ({"squeeze": {"fingers": ["a", "b"], "damper": 2.0}}, "unstable at 400 Hz"),
-        ({"squeeze": {"fingers": ["a", "b"], "spring": 0.0}}, "spring is 0"),
+        ({"squeeze": {"fingers": ["a", "b"], "spring": 0.0}}, "squeeze: spring 0; want 1e-06 to 1e.09"),
         ({"link1_m": 0.0}, "link1_m is 0"),
         ({"link_stiffness": -1.0}, "link_stiffness -1"),
     ],
