@@ -135,6 +135,88 @@ def _row(angles: Array, derivative: int = 0) -> Array:
     return out
 
 
+class Oval:
+    """An ellipse, by its support function about a middle: h = sqrt(p + q cos 2t + r sin 2t).
+
+    Args:
+        x, y: its middle [m].
+        p, q, r: as above [m^2]; p > |(q, r)|.
+    """
+
+    def __init__(self, x: float, y: float, p: float, q: float, r: float) -> None:
+        self.x, self.y, self.p, self.q, self.r = x, y, p, q, r
+
+    def told(self, angle: float) -> tuple[float, float, float]:
+        """Return h, h' about the origin and the radius of curvature [m] where the outward normal is `angle` [rad]."""
+        c, s, c2, s2 = math.cos(angle), math.sin(angle), math.cos(2.0 * angle), math.sin(2.0 * angle)
+        h = math.sqrt(self.p + self.q * c2 + self.r * s2)
+        slope = (self.r * c2 - self.q * s2) / h
+        squares = self.p**2 - self.q**2 - self.r**2
+        return self.x * c + self.y * s + h, self.y * c - self.x * s + slope, squares / h**3
+
+    def parallels(self, direction: float) -> list[Parallel]:
+        """Return its two parallel grasps within a right angle of a direction [rad], by the angle to it."""
+        axis = 0.5 * math.atan2(self.r, self.q)
+        found = []
+        for turn in (axis, axis + 0.5 * math.pi):
+            psi = turn if math.cos(turn - direction) > 0.0 else turn + math.pi
+            h = math.sqrt(self.p + self.q * math.cos(2.0 * psi) + self.r * math.sin(2.0 * psi))
+            found.append(Parallel(self.x, self.y, psi, 2.0 * h, 0.0))
+        return sorted(found, key=lambda one: abs(math.remainder(one.direction - direction, math.tau)))
+
+
+def fitted_oval(touches: Sequence[Touch]) -> Oval | None:
+    """Return the ellipse that agrees with all touches; None where none does.
+
+    Two touches tell eight numbers, an ellipse has five. By Gauss and Newton, from the disk about the touches.
+    """
+    points = np.array([touch.point for touch in touches])
+    middle = points.mean(axis=0)
+    size = 0.5 * float(np.hypot(*np.ptp(points, axis=0)))
+    radii = [touch for touch in touches if 0.0 < touch.radius_m < SIDE_M]
+    if len(radii) < len(touches) or not size > 1e-3:
+        return None
+    scale = np.array([size, size, size**2, size**2, size**2])
+
+    def off(at: Array) -> Array | None:
+        x, y, p, q, r = (at * scale).tolist()
+        if not p > 1.001 * math.hypot(q, r):
+            return None
+        oval, found = Oval(x, y, p, q, r), []
+        for touch, (px, py) in zip(touches, (points - middle).tolist(), strict=True):
+            c, s = math.cos(touch.normal), math.sin(touch.normal)
+            h, slope, radius = oval.told(touch.normal)
+            found += [(h - px * c - py * s) / PLACE_M, (slope + px * s - py * c) / PLACE_M]
+            found.append((radius - touch.radius_m) / touch.radius_deviation_m)
+        return np.array(found)
+
+    at = np.array([0.0, 0.0, 1.0, 0.0, 0.0])
+    now = off(at)
+    for _ in range(_ROUNDS):
+        if now is None:
+            return None
+        columns = [off(at + step) for step in 1e-6 * np.eye(5)]
+        if any(column is None for column in columns):
+            return None
+        slopes = np.stack([(column - now) * 1e6 for column in columns if column is not None], axis=1)
+        way = np.linalg.lstsq(slopes, -now, rcond=None)[0]
+        after = None
+        for share in (1.0, 0.5, 0.25, 0.1, 0.02):
+            after = off(at + share * way)
+            if after is not None and after @ after < now @ now:
+                at, now = at + share * way, after
+                break
+        else:
+            break
+    if now is None or now @ now > _AGREES * (len(now) - 5):
+        return None
+    x, y, p, q, r = (at * scale).tolist()
+    return Oval(x + float(middle[0]), y + float(middle[1]), p, q, r)
+
+
+_ROUNDS = 40
+_AGREES = 4.0  # chi-squared for each number that is told beyond five
+
 SIDE_M, CORNER_M = 0.2, 4e-3
 """Radii of curvature from which on a touch is one of a straight side, and up to which it is one of a corner [m]."""
 ROUND_M = 8e-3
@@ -144,6 +226,7 @@ _AGREE_M = 0.2e-3
 _USUAL_M = 1.5e-3  # radius of a corner that nobody has touched
 _ASIDE = 0.3
 _PARALLEL = math.radians(1.0)
+_ENDS = math.radians(10.0)  # by which the felt normal of a side that ends may be off, at most
 
 
 def expected(touches: Sequence[Touch], held: Grasp) -> list[Parallel]:
@@ -156,6 +239,8 @@ def expected(touches: Sequence[Touch], held: Grasp) -> list[Parallel]:
     touches = with_corners(touches)
     if (between := _between_sides(touches, held.direction)) is not None:
         return [between]
+    if (beside := _beside_ends(touches, held.direction)) is not None:
+        return [beside]
     new = touches[-2:]
     sides = [touch.radius_m > SIDE_M for touch in new]
     if all(sides):
@@ -164,6 +249,8 @@ def expected(touches: Sequence[Touch], held: Grasp) -> list[Parallel]:
         bends = [0.0 if side else 1.0 / touch.radius_m for side, touch in zip(sides, new, strict=True)]
         x, y, psi, d, _, _ = regrasp_convex(held, (bends[0], bends[1]))
         return [Parallel(x, y, psi, d - 2.0 * FINGER_M, math.inf)]
+    if (oval := fitted_oval(touches)) is not None:
+        return oval.parallels(held.direction)
     return Shape(touches).parallels(held.direction)
 
 
@@ -203,6 +290,28 @@ def _between_sides(touches: Sequence[Touch], direction: float) -> Parallel | Non
             x, y = (0.5 * (a + b) for a, b in zip(one.point, other.point, strict=True))
             across = (one.point[0] - other.point[0]) * math.cos(psi) + (one.point[1] - other.point[1]) * math.sin(psi)
             return Parallel(x, y, psi, abs(across), 0.0)
+    return None
+
+
+def _beside_ends(touches: Sequence[Touch], direction: float) -> Parallel | None:
+    """Return the grasp across a side that was touched before, where the present one meets the ends of two sides.
+
+    Of a side that ends under a finger neither normal nor radius is felt. The side that is known tells the direction;
+    the place is half the way back to where it was touched.
+    """
+    *past, one, two = touches
+    if not all(CORNER_M < touch.radius_m < SIDE_M for touch in (one, two)):
+        return None
+    for side in reversed(past):
+        off = [abs(math.sin(touch.normal - side.normal)) for touch in (one, two)]
+        if side.radius_m <= SIDE_M or max(off) > math.sin(_ENDS):
+            continue
+        psi = side.normal if math.cos(side.normal - direction) > 0.0 else side.normal + math.pi
+        c, s = math.cos(psi), math.sin(psi)
+        x, y = (0.5 * (a + b) for a, b in zip(one.point, two.point, strict=True))
+        back = 0.5 * ((side.point[1] - y) * c - (side.point[0] - x) * s)
+        across = (two.point[0] - one.point[0]) * c + (two.point[1] - one.point[1]) * s
+        return Parallel(x - back * s, y + back * c, psi, abs(across), math.inf)
     return None
 
 

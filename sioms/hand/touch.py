@@ -156,6 +156,7 @@ class Manner:
         roll_s: how long it rolls at most [s]; a wedge of two sides may never become parallel.
         clearance_m: by which each finger leaves the object before it moves.
         tolerance_rad: |eta| of a grasp that counts as parallel.
+        held_rad: |eta| up to which a grasp is held without another regrasp or roll; holding corrects it.
         frames: averaged where a grasp is sensed.
         light_rad: |eta| from which on it warns of the friction cone.
         squeeze_rad: |eta| from which on a touch is not squeezed, but regrasped as it is.
@@ -180,6 +181,7 @@ class Manner:
     roll_s: float = 30.0
     clearance_m: float = 8e-3
     tolerance_rad: float = math.radians(0.3)
+    held_rad: float = math.radians(1.0)
     frames: int = 40
     light_rad: float = math.radians(30.0)
     squeeze_rad: float = math.radians(45.0)

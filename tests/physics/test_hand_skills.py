@@ -38,6 +38,15 @@ def test_a_rectangle_is_regrasped_once_and_held_parallel() -> None:
     assert found.likeness is Likeness.PARALLEL and max(map(abs, found.curvatures)) < 5.0
 
 
+def test_what_is_nearly_parallel_is_held_and_corrected_there() -> None:
+    hand, skills = plane(rectangle(30 * MM, 80 * MM, 2 * MM), (0.0, 0.0, 0.7 * DEG / 2.0))
+    first: list[float] = []
+    skills.sensed = lambda: first.append(hand.truth().quality)
+    hand.run(skills.hold_parallel(2.0))
+    assert 0.35 * DEG < first[0] < 0.9 * DEG
+    assert (skills.regrasps, skills.rolls) == (0, 0) and hand.truth().quality < 0.2 * DEG
+
+
 def test_a_disk_is_rolled_until_it_is_held_parallel() -> None:
     hand, skills = plane(disk(20 * MM), (3 * MM, 6 * MM, 0.0))
     first = hand.run(skills.grasp())

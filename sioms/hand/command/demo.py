@@ -30,7 +30,7 @@ FILM_HZ = 12.5
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("--object", type=whole(), default=1, metavar="N", help="number of the object (default 1)")
+    parser.add_argument("--object", type=whole(), default=19, metavar="N", help="number of the object (default 19)")
     parser.add_argument("-o", "--output", type=Path, default=Path("out"), help="folder for picture and animation")
     parser.add_argument("--no-animation", action="store_true", help="write the picture only")
     parser.add_argument("--quiet", action="store_true", help="draw nothing in the terminal")

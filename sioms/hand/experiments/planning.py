@@ -58,7 +58,7 @@ def plan_regrasps(subject: Subject, seed: int = 0, steps: int = 2, manner: Manne
     etas = [found[0].quality]
     rolls = found[1].force > manner.light_n and skills.would_roll(found[1])
     for _ in range(steps):
-        if etas[-1] < manner.tolerance_rad:
+        if etas[-1] < manner.held_rad - 3.0 * _PLACE:
             break
         target = skills.after(found[1])
         found = object_.touch(*target[:3], manner)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sioms.hand.contacts import Grasp, grasp_of
-from sioms.hand.shape import Shape, Touch, across_sides, expected, with_corners
+from sioms.hand.shape import Shape, Touch, across_sides, expected, fitted_oval, with_corners
 
 A, B = 0.035, 0.022
 FINGER = 12.7e-3
@@ -143,3 +143,37 @@ def test_sides_meet_in_the_middle_of_a_rounded_corner() -> None:
     centre = np.linalg.solve(np.array([n1, n2]), np.array([n1 @ sharp[2], n2 @ sharp[2]]) - rounded)
     assert found.x == pytest.approx(centre[0], abs=1e-6)
     assert found.apart_m == pytest.approx(centre[1] + rounded, abs=1e-6)
+
+
+@pytest.mark.parametrize("at", [25.0, 50.0, 80.0])
+@pytest.mark.parametrize("turn", [0.0, 0.6, 2.1])
+def test_two_touches_tell_an_ellipse(turn: float, at: float) -> None:
+    touches = []
+    for one in (on_ellipse(math.radians(at), 2e-4), on_ellipse(math.radians(at + 165.0), 2e-4)):
+        (x, y), c, s = one.point, math.cos(turn), math.sin(turn)
+        touches.append(Touch((c * x - s * y + 0.1, s * x + c * y - 0.05), one.normal + turn, one.radius_m, 2e-4))
+    found = fitted_oval(touches)
+    assert found is not None
+    first, second = sorted(found.parallels(turn + 0.1), key=lambda one: -one.apart_m)
+    assert (first.apart_m, second.apart_m) == pytest.approx((2 * A, 2 * B), rel=1e-4)
+    assert (first.x, first.y) == pytest.approx((0.1, -0.05), abs=1e-6)
+    assert math.sin(first.direction - turn) == pytest.approx(0.0, abs=1e-4)
+    assert expected(touches, held(*touches))[0].deviation == 0.0
+
+
+def test_what_is_no_ellipse_is_not_taken_for_one() -> None:
+    # a quarter of a disk's width between two arcs of 40 mm: a lens
+    lens = [Touch((0.0, 10e-3), 0.5 * math.pi, 40e-3, 4e-4), Touch((0.0, -10e-3), -0.5 * math.pi, 40e-3, 4e-4)]
+    aside = Touch((8e-3, 3e-3), 0.2, 25e-3, 4e-4)
+    assert fitted_oval([*lens, aside]) is None
+    side = Touch((0.0, 10e-3), 0.5 * math.pi, 10.0, 1.0)
+    assert fitted_oval([side, lens[1]]) is None
+
+
+def test_where_sides_end_under_both_fingers_the_side_that_is_known_is_held() -> None:
+    # a bar of 50 mm, its sides along y, touched once on a side at y = 30 mm, then at both of its ends
+    side = Touch((25e-3, 30e-3), 0.0, 10.0, 1.0)
+    ends = Touch((-25e-3, 2e-3), math.pi + 0.06, 12e-3, 1e-3), Touch((25e-3, 0.0), -0.06, 12e-3, 1e-3)
+    (found,) = expected([Touch((-25e-3, 1e-3), math.pi, 3e-3, 1e-3), side, *ends], held(*ends))
+    assert math.sin(found.direction) == pytest.approx(0.0, abs=1e-9)
+    assert found.y == pytest.approx(15.5e-3, abs=1e-6) and found.apart_m == pytest.approx(50e-3)
