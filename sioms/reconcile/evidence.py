@@ -16,6 +16,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.engine.evidence import described, frequency
 from sioms.reconcile.engine.fit import get
 from sioms.reconcile.fit import Fit, Problem, block_ids, refit
+from sioms.reconcile.plausible import size
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.verdict import Estimate, NamedEffect, apart
 
@@ -88,10 +89,13 @@ def describe(
             for p in effect.parameters
         )
         evidence = [finding.evidence] if finding is not None else []
-        evidence.append(f"without it, {100 * saved:.1f} % of the residual would return ({errors:.1f} standard errors)")
+        evidence.append(f"explains {100 * saved:.1f} % of what remains without it ({errors:.1f} standard errors)")
         numbers = {r.rival: _numbers(r) for r in others if r.effect == name}
         worth = saved, errors, often
-        named.append(described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, numbers))
+        wider = [n for n, other in known().items() if name in other.replaces and size(n) > size(name)]
+        named.append(
+            described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, numbers, wider)
+        )
     return apart(sorted(named, key=lambda e: -e.saved))
 
 

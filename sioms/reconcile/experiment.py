@@ -82,7 +82,7 @@ def catalogue(model: AxisModel, envelope: Envelope, duration_s: float = DURATION
         _shuttle(cruise, e, dt, duration_s),
     )
     half = min(0.55 * WHOLE, e.reach) if model.rotary else e.reach
-    turn = ", one full turn" if model.rotary and half >= 0.5 * WHOLE else ""
+    turn = ", more than one full turn" if model.rotary and half >= 0.5 * WHOLE else ""
     speed = min(4.2 * half / duration_s, e.speed)
     path = np.concatenate([_move(half, speed, e, dt), _move(-2.0 * half, speed, e, dt), _move(half, speed, e, dt)])
     yield Experiment("full_turn", f"slowly over {2.0 * half:.3g} {unit} and back{turn}", _lap(path, e, dt, duration_s))

@@ -103,19 +103,25 @@ def told_apart(
     rivals: Iterable[Rival[F]],
     ladder: Iterable[Step[Any]],
     present: Container[str],
+    wider: Container[str] = (),
 ) -> tuple[dict[str, str], dict[str, str]]:
     """Say of each look-alike of a named effect why it is ruled out, or why it is not.
 
     Args:
         present: effects of the model, which rule nothing out.
+        wider: effects that contain this one: the search has tried them in its place, and they did not save enough more.
 
     Returns:
         Reasons of those ruled out, and of those left open, by name.
     """
     mine = [r for r in rivals if r.effect == name]
-    still = {r.rival: f"leaves only {100 * r.missed:.1f} % of the effect unexplained" for r in mine if r.open}
+    still = {
+        r.rival: f"explains {100 * (1.0 - max(r.missed, 0.0)):.3g} % of the effect as well" for r in mine if r.open
+    }
     ruled = {
-        rival: f"removed {100 * gain:.3g} % of the residual where this effect removed {100 * step.saved:.3g} %"
+        rival: "contains this effect, and explains no more with more parameters"
+        if rival in wider and gain < step.saved + GAIN
+        else f"removed {100 * gain:.3g} % of the residual where this effect removed {100 * step.saved:.3g} %"
         for step in ladder
         if step.effect == name
         for rival, gain in step.rivals.items()

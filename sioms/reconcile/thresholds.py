@@ -169,6 +169,9 @@ cruising speed, where no motion is; a resonator whose spring hardens 0.3 (0560).
 FREE_NEAR = 2.0
 """Above this multiple of its floor it is said how far a free run stays from it. Seventeen of the forty axes: 1.83 at
 most (0560)."""
+NOISE = 4.0 / 3.0
+"""Up to this multiple of its floor a report says of what remains that it is noise: a floor is right within a third on
+right models (0562)."""
 STUCK = 0.2
 """A model is at rest during at most this share of the way that the machine went. Seventeen of the forty axes: none at
 all (0560)."""

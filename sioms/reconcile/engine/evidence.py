@@ -37,6 +37,7 @@ def described(
     ladder: Sequence[Step[Any]],
     present: Iterable[str],
     numbers: Mapping[str, str],
+    wider: Iterable[str] = (),
 ) -> NamedEffect:
     """Describe an effect of a model.
 
@@ -45,8 +46,9 @@ def described(
         others: look-alikes that were refitted.
         present: effects of the model.
         numbers: with which numbers a look-alike stands in its place, for some.
+        wider: effects that contain this one.
     """
-    ruled, still = told_apart(effect.name, effect.lookalikes, others, ladder, set(present))
+    ruled, still = told_apart(effect.name, effect.lookalikes, others, ladder, set(present), set(wider))
     still = {rival: text + (f", with {numbers[rival]}" if rival in numbers else "") for rival, text in still.items()}
     return NamedEffect(
         effect.name,

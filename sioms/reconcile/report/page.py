@@ -8,9 +8,22 @@ import numpy as np
 
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.report.pictures import pictures
-from sioms.reconcile.report.words import CHANCE, columns, groups, headline, in_words, number, places, shrunk, span
+from sioms.reconcile.report.words import (
+    CHANCE,
+    columns,
+    groups,
+    headline,
+    in_words,
+    number,
+    places,
+    remains,
+    shrunk,
+    span,
+    sureness,
+)
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.session import knobs
+from sioms.reconcile.thresholds import NOISE
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Verdict
 from sioms.report_page import Cell, Page
 
@@ -23,6 +36,29 @@ SESSION = {
     "zero": "encoder zero",
     "heat": "heat state at the start",
 }
+
+
+OF_AXES = (
+    "Root mean square on held-out samples, which were not used for any choice. In closed loop the model and its "
+    "controller follow the recorded command; running free, the model gets the recorded force and nothing else, so "
+    "small errors add up; in short windows it is corrected by the measurement all along, and its error is given as a "
+    "force."
+)
+OF_SENSORS = (
+    "Root mean square on held-out touches or loads (every fifth), which were not used for any choice. The parameters "
+    "of the model are fixed; the zero, the true load of a touch and the level of a ramp are estimated for the session "
+    "in all columns."
+)
+FLOOR = (
+    "The noise floor is what noise alone would leave. It is an estimate of its own, right within a third, so what "
+    "remains may come out below it."
+)
+LATER = (
+    "Table and pictures show the model that was fitted without the held-out samples. The last two columns are its "
+    "error on their later half: as it is, and with offset and friction of the session estimated again on their "
+    "earlier half."
+)
+FINAL = " The parameters above and model.toml come from a final fit to all records after that."
 
 
 def page(v: Verdict, seconds: float, *, draw: bool = True) -> Page:
@@ -40,11 +76,7 @@ def page(v: Verdict, seconds: float, *, draw: bool = True) -> Page:
                 p.figure(drawn[name])
 
     _opening(p, v)
-    p.head("Where model and measurement disagreed")
-    p.text(_where(v))
-    show("places", "spectra")
     if v.effects or v.symbolic:
-        p.head("What was missing")
         _what(p, v)
         show("each")
     if v.candidates:
@@ -54,26 +86,31 @@ def page(v: Verdict, seconds: float, *, draw: bool = True) -> Page:
             "given; model.toml has them switched off."
         )
         p.items(f"{c.title}: {c.why}" for c in v.candidates)
+    _next(p, v)
     p.head("Model error before and after")
     _gaps(p, v)
     show("gaps", "curves")
-    p.head("Evidence, and alternatives")
-    for e in (*v.effects, *v.symbolic):
-        p.lesser(e.title)
-        p.items(_why(e, v))
-    if not v.effects and not v.symbolic:
-        p.text("Nothing is named." if v.candidates else "No effect was identified.")
-    _next(p, v)
+    if v.effects or v.symbolic:
+        p.head("Evidence, and alternatives")
+        for e in (*v.effects, *v.symbolic):
+            p.lesser(e.title)
+            p.items(_why(e, v))
+        if len(v.effects) + len(v.symbolic) > 1:
+            p.text("Each share is of what remains when this effect alone is left out: they add up to more than 100 %.")
+    p.head("Where the nominal model disagreed")
+    p.text(_where(v))
+    show("places", "spectra")
     p.head("How it was found")
     _ladder(p, v)
     if isinstance(v, AxisVerdict) and v.states:
         _session(p, v)
+    _alike(p, v)
     p.small(f"{_footing(v)} {seconds:.1f} s.")
     return p
 
 
 def _opening(p: Page, v: Verdict) -> None:
-    """Put the verdict first, with where it disagreed and how far the gap shrank."""
+    """Put the verdict first, how sure it is, what to do next, and how far the gap shrank."""
     sets = [[e.name for e in v.effects], *v.alternatives]
     lines = [f"{v.outcome.value} - {headline(v)}"]
     if v.alternatives:
@@ -82,7 +119,10 @@ def _opening(p: Page, v: Verdict) -> None:
         lines += [in_words(e) for e in v.effects]
     if v.outcome is Outcome.UNEXPLAINED and v.notes:  # the last of them is why
         lines.append(f"{v.notes[-1][0].upper()}{v.notes[-1][1:]}")
-    if where := places(v, 2):
+    lines.append(sureness(v))
+    if v.experiment is not None:
+        lines.append(f"Next: {v.experiment.text}; that decides between the candidates.")
+    if v.outcome is not Outcome.NONE and (where := places(v, 2)):
         lines.append(f"{where[0].upper()}{where[1:]}")
     by = " of the refused model" if v.candidates and not v.effects else ""
     lines.append(f"Model error{by} on held-out data, {shrunk(v.speaking)}")
@@ -94,17 +134,51 @@ def _where(v: Verdict) -> str:
     if not shown:
         return "The residual of the nominal model depends on no variable (permutation p > 0.05)."
     text = "; ".join(f"{q.variable} {100 * q.explained:.0f} % (p = {q.p:.2f})" for q in shown)
+    harmless = " That is too little for an effect." if v.outcome is Outcome.NONE else ""
     return (
         "Share of the squared residual of the nominal model that its mean as a function of one variable explains "
-        f"(bars: spread about the mean; p: how often chance does as well): {text}."
+        "(variables go together, so these shares overlap; bars: spread about the mean; p: how often chance does as "
+        f"well): {text}.{harmless}"
     )
 
 
 def _what(p: Page, v: Verdict) -> None:
+    """Lay out what is missing: effects by name, candidates for one place, and what only describes the remainder."""
+    if v.effects:
+        p.head("Candidates" if v.alternatives else "What was missing")
+        _numbers(p, v.effects)
+    if v.alternatives:
+        p.text(
+            "These numbers hold if the first candidate is what is missing; their intervals say nothing about which one "
+            "it is. In its place:"
+        )
+        p.items(_instead(v))
+    if v.symbolic:
+        p.head("A formula for the rest, without a name")
+        p.text(
+            "It describes the residual, and model.toml predicts with it. It is no property of the machine; where an "
+            "interval is wide or contains 0, its terms make up for each other: do not use their numbers one by one."
+        )
+        _numbers(p, v.symbolic)
+
+
+def _instead(v: Verdict) -> Iterator[str]:
+    """Name the other candidates, with their numbers where there are any."""
+    numbers_of = v.others if isinstance(v, AxisVerdict) and len(v.others) == len(v.alternatives) else ()
+    for i, names in enumerate(v.alternatives):
+        told = []
+        for name in names:
+            values = numbers_of[i].get(name, {}) if numbers_of else {}
+            numbers = ", ".join(f"{symbol} = {number(value)}" for symbol, value in values.items())
+            told.append((v.title(name) or name) + (f" ({numbers})" if numbers else ""))
+        yield " and ".join(told) or "nothing"
+
+
+def _numbers(p: Page, effects: Sequence[NamedEffect]) -> None:
     rows: list[Sequence[object]] = []
     every = []
-    for e in (*v.effects, *v.symbolic):
-        label, equation = e.title if e in v.effects else "without a name", e.equation
+    for e in effects:
+        label, equation = e.title, e.equation
         for mine in groups(e).values():
             rows.append((label, equation, *_quantity(mine)))
             label = equation = ""
@@ -134,28 +208,20 @@ def _quantity(mine: list[Estimate]) -> tuple[object, ...]:
 
 def _gaps(p: Page, v: Verdict) -> None:
     of_axis = isinstance(v, AxisVerdict)
-    p.text(
-        "Root mean square on held-out samples, which were not used for any choice. Noise alone would leave the floor."
-        if of_axis
-        else "Root mean square on held-out touches or loads (every fifth), which were not used for any choice. The "
-        "parameters of the model are fixed; the zero, the true load of a touch and the level of a ramp are estimated "
-        "for the session in all columns."
-    )
-    head = ["channel", "before", "after", "noise floor", "unit", "floor from", "closed"]
+    p.text(OF_AXES if of_axis else OF_SENSORS)
+    p.text(f"{FLOOR} The verdict rests on the row '{v.speaking.channel}'.")
+    head = ["channel", "before", "after", "noise floor", "unit", "what remains", "gap closed", "floor from"]
     rows = []
     for g in v.gaps:
-        closed = f"{100 * g.closed:.1f} %" if of_axis or g.before > 1.15 * g.floor else "no gap"
-        closed = closed if g.known else "unknown"
+        has_gap = g.known and g.before > NOISE * g.floor
+        closed = f"{100 * g.closed:.1f} %" if has_gap else "no gap" if g.known else "unknown"
         ends = [Cell(number(x)) for x in (g.before, g.after, g.floor)]
-        row = [g.channel, *ends, g.unit, g.floor_from, Cell(closed)]
+        row = [g.channel, *ends, g.unit, remains(g) if g.known else "unknown", Cell(closed), g.floor_from]
         later = [Cell("-" if x is None else number(x)) for x in (g.frozen, g.session)]
         rows.append([*row, *later] if of_axis else row)
     p.table([*head, "later half, frozen", "later half, session re-estimated"] if of_axis else head, rows)
     if of_axis:
-        p.text(
-            "Table and pictures show the model that was fitted without the held-out samples. The parameters of the "
-            "effects and model.toml come from a final fit to all records after that."
-        )
+        p.text(LATER + (FINAL if v.effects else ""))
 
 
 def _why(e: NamedEffect, v: Verdict) -> Iterator[str]:
@@ -169,7 +235,8 @@ def _why(e: NamedEffect, v: Verdict) -> Iterator[str]:
 
 def _next(p: Page, v: Verdict) -> None:
     """Tell what to do next: the experiment that decides, what was not excited, what looks alike here, the notes."""
-    if v.experiment is None and not v.missing and not v.pairs and not v.notes:
+    pairs = _pairs(v)
+    if v.experiment is None and not v.missing and not pairs and not v.notes:
         return
     p.head("Next")
     if v.experiment is not None:
@@ -179,11 +246,29 @@ def _next(p: Page, v: Verdict) -> None:
     if v.missing:
         p.text("Not judged, because these records do not excite it (with the record that would):")
         p.items(f"{t}: {x}" for n, x in v.missing.items() if (t := v.title(n)))
-    if v.pairs:
-        alike = "; ".join(f"{a} and {b} ({100 * c:.0f} % in common)" for a, b, c in v.pairs)
-        p.text(f"Indistinguishable in these records: {alike}.")
+    if pairs:
+        p.text("Would show almost alike in these records:")
+        p.items(f"{a} and {b}, {100 * c:.0f} % in common" for a, b, c in pairs)
     for note in v.notes:
         p.text(note)
+
+
+def _pairs(v: Verdict) -> list[tuple[str, str, float]]:
+    """Return the pairs that look alike with one in the verdict and the other not ruled out, by their titles."""
+    mine = {e.name for e in v.effects} | {n for names in v.alternatives for n in names}
+    ruled = {n for e in v.effects for n in e.ruled_out}
+    return [
+        (v.title(a) or a, v.title(b) or b, c)
+        for a, b, c in v.pairs
+        if {a, b} & mine and not {a, b} <= mine and not {a, b} & ruled
+    ]
+
+
+def _alike(p: Page, v: Verdict) -> None:
+    """List every pair that looks alike in these records, folded."""
+    if v.pairs:
+        rows = [(v.title(a) or a, v.title(b) or b, Cell(f"{100 * c:.0f} %")) for a, b, c in v.pairs]
+        p.table(("effect", "effect", "in common"), rows, folded="effects that would show alike in these records")
 
 
 def _ladder(p: Page, v: Verdict) -> None:
@@ -229,6 +314,5 @@ def _footing(v: Verdict) -> str:
         )
     return (
         f"{v.samples} samples equal {v.effective_samples:.0f} independent ones; the residual of the final model is "
-        f"{v.ratio:.2f} times the expected innovation; {smoother}; {100 * v.burst_share:.0f} % of the residual lies in "
-        "the largest tenth."
+        f"{v.ratio:.2f} times what noise leaves; {smoother}; {100 * v.burst_share:.0f} % of the residual is in bursts."
     )

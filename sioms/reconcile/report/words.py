@@ -9,6 +9,7 @@ from typing import Any
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.session import knobs
+from sioms.reconcile.thresholds import NOISE
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Verdict
 
 HEAD = {
@@ -29,6 +30,40 @@ def headline(v: Verdict) -> str:
     if v.candidates:
         return "Something is missing, and no model that was tried holds: nothing is named."
     return HEAD[v.outcome]
+
+
+def sureness(v: Verdict) -> str:
+    """Say how far the verdict can be relied on, and on what that rests."""
+    left = f"on held-out data {remains(v.speaking)}{_above(v)}"
+    match v.outcome:
+        case Outcome.NONE:
+            untried = ", ".join(t for n in v.missing if (t := v.title(n)))
+            return f"How sure: {left}." + (
+                f" Not tested, as these records do not excite it: {untried}." if untried else ""
+            )
+        case Outcome.NAMED:
+            still = ", ".join(t for e in v.effects for n in e.open if (t := v.title(n)))
+            rest = f"not ruled out: {still}" if still else "what could stand in its place is ruled out"
+            return f"How sure: {left}; {rest}."
+        case Outcome.AMBIGUOUS:
+            return f"How sure: something is missing, and each of the candidates explains it; {left}."
+    known = "what has a name is sure as far as its evidence goes; the rest" if v.effects else "what it is"
+    return f"How sure: something is missing; {known} is not known. Do not rely on the numbers of a formula for it."
+
+
+def _above(v: Verdict) -> str:
+    """Say where most is left beside the row that speaks for all, if that is more than noise."""
+    others = [(g.after / g.floor, g) for g in v.gaps if g is not v.speaking and g.known and g.floor > 0.0]
+    times, most = max(others, key=lambda o: o[0], default=(0.0, v.speaking))
+    return f", but {times:.2g} times as much in the row '{most.channel}'" if times > NOISE else ""
+
+
+def remains(gap: Gap) -> str:
+    """Say how what remains compares with what noise alone leaves, whose estimate is right within a third."""
+    if not gap.known:
+        return "how much of what remains is noise is not known"
+    times = gap.after / gap.floor if gap.floor > 0.0 else math.inf
+    return "only noise remains" if times <= NOISE else f"{times:.2g} times the noise remains"
 
 
 def number(value: float) -> str:
