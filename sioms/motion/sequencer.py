@@ -286,9 +286,10 @@ class Sequencer:
         self._run_now(axes, STOP, start_ns)
 
     def hold(self, axes: Axes, position: Floats, start_ns: int) -> None:
-        """Rest at position, which is where they are."""
+        """Rest at position, which is where they are; what waited for the end of something else begins."""
         self.store.put_hold(self.store.row[axes], position)
         self._run_now(axes, HOLD, start_ns)
+        self.release(axes, start_ns)
 
     def stay(self, axes: Axes, position: Floats, now_ns: int) -> None:
         """Have axes that rest or settle rest at position instead."""

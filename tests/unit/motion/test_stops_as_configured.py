@@ -509,3 +509,22 @@ def test_an_axis_stands_soon_whatever_a_command_has_set(
     way = speed**2 / (2 * min(2.0, weakest)) + 0.1 * speed + carried + 0.01
     assert abs(plant.position - place) <= 2 * way
     assert bool(int(rig.field("status")) & AxisStatus.EMERGENCY_STOP) == emergency
+
+
+def test_a_command_that_waits_for_a_brake_begins_where_the_brake_yields() -> None:
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant, k=4e4, kz=-0.95, kb=-4.0, force_max=50.0, acceleration_max=2.0)
+    rig.write(mode=FORCE, force=3.0)
+    rig.tick(100)
+    assert plant.velocity > 0.2
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(2)
+    rig.write(mode=POSITION | TIME, position=plant.position - 0.05, time=0.5)
+    rig.tick(2)
+    assert rig.field("buffered") == 1, "it waits for the end of the brake"
+    target, plant.velocity, plant.wall = plant.position - 0.05, 0.0, plant.position  # it runs into something
+    rig.tick(2)
+    assert rig.field("commanded_position") == pytest.approx(plant.position, abs=1e-4), "and does not press on that"
+    rig.tick(600)
+    assert rig.field("buffered") == 0 and rig.bank.is_idle(rig.axes)
+    assert plant.position == pytest.approx(target, abs=2e-3)
