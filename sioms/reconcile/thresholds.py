@@ -259,6 +259,8 @@ FEW_STEADY, FEW_PUSHED, STUDENT = 6, 2, 2.4
 acceleration that are needed each way; and what few tell is less sure by Student's factor, about 1 + this over the
 degrees of freedom: 2.2 of two (1011)."""
 
+SPEED_KNOWN = 0.02
+"""The speed at which an edge is passed is known to within this share, as far as it may change (STEADY)."""
 FEWEST_BLOCKS = 20
 """What is normal is not learnt from fewer blocks of 20 s of motion. Seed 5 (0621)."""
 IDLE_SHARE = 0.006
@@ -283,6 +285,9 @@ MODEL_SHARE = 0.002
 MOST_PLACE, MOST_SCALE = 0.1, 0.05
 """What place and play of a reference, of the travel, and its scale may be at most (one standard deviation): a pulley or
 an encoder that is a quarter off does not get into production (0621)."""
+MOST_LATE_S = 0.02
+"""How late a reference may be told (one standard deviation): filters of inputs go from 0.1 to 20 ms, and buses are
+polled every 1 to 20. Where only one speed is seen, play and lateness are not told apart (1040)."""
 MASS_TOLD = 1e4
 """A mass is told by a move whose acceleration explains this many times what is left: to a percent (0621)."""
 

@@ -25,6 +25,8 @@ from .rows import PLAYS, Known, rows_of
 WINDOWS = (3, 6, 12, 24)
 #: An edge of the reference counts where the commanded speed was the same for so long [s], within this share of it.
 STEADY_S, STEADY = 0.03, 0.02
+#: The speed at which it is passed is that of so long before it is told [s].
+LATELY_S = 0.01
 #: ... or where it was changed all the same way, by this share of the axis's speed at least: then inertia says which
 #: flank of a play bears.
 PUSHED_S, PUSHED = 0.04, 0.1
@@ -169,8 +171,13 @@ class AxisWatch:
                 way = float(np.sign(samples.speed[i])) if self._is_steady(samples, i) else 2.0 * self._push(samples, i)
                 place = float(np.interp(at, samples.time_s[i - 1 : i + 1], samples.position[i - 1 : i + 1]))
                 if way:
-                    self._collector.cross(Crossing(place, int(way)))
+                    self._collector.cross(Crossing(place, int(way), self._speed(samples, i)))
         self._edges = [e for e in self._edges if e > last]
+
+    def _speed(self, samples: Samples, i: int) -> float:
+        """Return the measured speed of the last moment: a short move is not as fast as it is told to be."""
+        before = max(i - max(round(LATELY_S / self.about.tick_s), 2), 0)
+        return float((samples.position[i] - samples.position[before]) / (samples.time_s[i] - samples.time_s[before]))
 
     def _is_steady(self, samples: Samples, i: int) -> bool:
         """Return whether the speed has been the same for a while: in a play the flank that bears follows from that."""

@@ -27,11 +27,12 @@ class Crossing:
     """The edge of a reference, as the axis reads its place: [m or rad].
 
     ``way``: -1 or 1, the way of the motion, at a steady speed; -2 or 2 where the axis accelerates that way, so that a
-    load behind a play is pushed that way.
+    load behind a play is pushed that way. ``speed``: of the axis, with its sign [m/s or rad/s].
     """
 
     place: float
     way: int
+    speed: float
 
 
 @dataclass(frozen=True, slots=True)

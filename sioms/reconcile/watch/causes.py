@@ -27,7 +27,7 @@ from sioms.reconcile.thresholds import (
 )
 
 from .moves import Array
-from .normal import ALL_NAMES, PLACE, PLAY, SCALE, TOTAL, UNKNOWN, Estimate, Normal
+from .normal import ALL_NAMES, LATE, PLACE, PLAY, SCALE, TOTAL, UNKNOWN, Estimate, Normal
 from .rows import CONSTANT, DRY, GAP, GIVE, LAG, MASS, PLAYS, SIZE, VISCOUS
 
 #: What orders an unexplained change.
@@ -35,7 +35,7 @@ ORDERED = {
     "mass": "acceleration", "viscous": "speed", "dry": "direction of motion", "constant": "nothing: it is constant",
     "lag": "change of the acceleration", "give": "second change of the acceleration", "gap0": "reversal of force",
     "gap1": "reversal of force", "gap2": "reversal of force", "place": "place of the reference",
-    "scale": "distance along the axis", "play": "direction of approach",
+    "scale": "distance along the axis", "play": "direction of approach", "late": "speed at the reference",
 }  # fmt: skip
 
 
@@ -94,8 +94,12 @@ CAUSES = (
     Cause("constant force", "a constant force has changed, or friction differs by direction", "{F}", _axis(CONSTANT)),
     Cause("elasticity", "the transmission yields more", "{m} s^2", _axis(GIVE), 0, "backlash"),
     Cause("drive lag", "the drive is later", "{m} s", _axis(LAG), 0, "backlash"),
+    Cause("late reference", "the reference is told later", "s", _axis(LATE)),
+    Cause("reference hysteresis", "the reference switches later either way: sensor or its target", "{x}", _axis(PLAY)),
 )  # fmt: skip
 BY_NAME = {cause.name: cause for cause in CAUSES}
+#: What a reference may have done where its edges move apart by the way of the motion.
+OF_REFERENCE = ("late reference", "reference hysteresis")
 #: Where a constant force holds the load at one flank, play shifts the reference, too.
 ONE_FLANK = Cause("backlash", BY_NAME["backlash"].text, "{x}", _axis(GAP, GAP + 1, GAP + 2, PLAY, LAG, GIVE, PLACE))
 
@@ -141,18 +145,21 @@ def judge(normal: Normal, now: Estimate, travel: float) -> Finding:
     slack = cover.copy()
     at = np.arange(SIZE)
     slack[at, at] += (BENT * bent / np.maximum(normal.per, 1e-300)) ** 2
-    places = float(np.abs(change[[PLACE, PLAY]]).max())
+    pace = now.pace if now.pace > 0.0 else 0.0
+    places = max(float(np.abs(change[[PLACE, PLAY]]).max()), pace * abs(float(change[LATE])))
     slack[[PLACE, PLAY], [PLACE, PLAY]] += (BENT * places) ** 2
     slack[SCALE, SCALE] += (BENT * places / travel) ** 2
+    slack[LATE, LATE] += (BENT * places / pace) ** 2 if pace else 0.0
     loose = {cause.name: _fit(cause, normal.theta, change, slack) for cause in CAUSES}
     lefts = {name: left for name, (left, *_) in loose.items()}
     names = _names(lefts)
     one = _fit(ONE_FLANK, normal.theta, change, slack)
     others = [left for name, left in lefts.items() if name != ONE_FLANK.name]
-    if one[0] < LEAVES and min(others) > one[0] + RIVAL and _behind(normal, now, change, travel)[0]:
+    shift = 2.0 * abs(float(change[PLACE]))
+    if one[0] < LEAVES and min(others) > one[0] + RIVAL and _behind(normal, now, change, travel, shift)[0]:
         names, loose[ONE_FLANK.name] = (ONE_FLANK.name,), one
-    if "backlash" in names and _is_no_play(normal, now, change):
-        names = tuple(name for name in names if name != "backlash")
+    if "backlash" in names:
+        names = _play_or_reference(names, normal, now, change, travel)
     if "place" in names or not names:
         names = _by_turns(names, normal, now, float(change[PLACE]))
     if names == ("place",) and not (_never_turned(normal, now, change) or _without_play(normal, now, change, travel)):
@@ -189,12 +196,60 @@ def _by_turns(names: tuple[str, ...], normal: Normal, now: Estimate, place: floa
     return ("backlash",) if apart and abs(play - twice) < PUSHED_APART[0] * twice + 2.0 * error else names
 
 
-def _is_no_play(normal: Normal, now: Estimate, change: Array) -> bool:
-    """Say whether edges are passed apart by the way, but not by the push, as of a reference that tells them late."""
+def _play_or_reference(
+    names: tuple[str, ...], normal: Normal, now: Estimate, change: Array, travel: float
+) -> tuple[str, ...]:
+    """Drop backlash, or what a reference may have done instead, where edges or reversals of force exclude it.
+
+    A reference that tells its edges late, or with a hysteresis, sets them apart by the way of the motion as a play
+    does, but not by the push, and nothing goes on by itself when the force turns. What separates neither leaves all.
+    """
+    play, variance = _play(normal, now, change)
+    if variance > (TOLD_PLAY * play) ** 2:
+        return names
     back, forth, error = now.turned
-    play = abs(float(change[PLAY]))
-    told = now.noise[PLAY, PLAY] + normal.own[PLAY, PLAY] < (TOLD_PLAY * play) ** 2
-    return bool(told and abs(forth - back - normal.turned) + 2.0 * error < PUSHED_APART[0] * play)
+    by_push = forth - back - normal.turned
+    # how far each would set edges apart by the push
+    made = {"backlash": play, "reference hysteresis": now.by_way * play}
+    if now.pace > 0.0:
+        made["late reference"] = now.by_speed * play / (2.0 * now.pace)
+    off = {name for name, apart in made.items() if abs(by_push - apart) > PUSHED_APART[0] * abs(play) + 2.0 * error}
+    proved, excluded = _behind(normal, now, change, travel, abs(play))
+    if _outweighs(normal, DRY):
+        off |= {"backlash"} if excluded else set()
+    else:
+        off -= {"backlash"}  # its friction may hold the load at one flank, whatever the push
+    shown = proved or ("backlash" not in off and {"reference hysteresis"} <= off)
+    if not shown and abs(play) < _wound(normal, now, change):
+        names = (*names, "elasticity") if "elasticity" not in names else names
+    return tuple(name for name in names if name not in off)
+
+
+def _outweighs(normal: Normal, *beside: int) -> bool:
+    """Say whether the inertia of what may be behind a play outweighs the constant force on the axis, and more forces
+    beside it: else it may never leave its flank.
+    """
+    holds = sum(abs(float(normal.theta[number])) for number in (CONSTANT, *beside))
+    return BEHIND_PLAY * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > holds
+
+
+def _wound(normal: Normal, now: Estimate, change: Array) -> float:
+    """Return how far a transmission that yields more may set edges apart: dry friction of the load winds it up.
+
+    What it yields shows in GIVE as well: there by both masses, of which each is BEHIND_PLAY of the whole or more.
+    """
+    error = 2.0 * float(np.sqrt(now.noise[GIVE, GIVE] + normal.own[GIVE, GIVE]))
+    masses = BEHIND_PLAY * (1.0 - BEHIND_PLAY) * float(normal.theta[MASS]) ** 2
+    return 2.0 * abs(float(now.theta[DRY])) * max(float(change[GIVE]) + error, 0.0) / max(masses, 1e-300)
+
+
+def _play(normal: Normal, now: Estimate, change: Array) -> tuple[float, float]:
+    """Return how far the reference's edges have moved apart by the way, all of it taken for play, and its variance: how
+    late they are told is what it was.
+    """
+    cover = now.noise + normal.own
+    tied = cover[PLAY, LATE] / cover[LATE, LATE]
+    return float(change[PLAY] - tied * change[LATE]), float(cover[PLAY, PLAY] - tied * cover[PLAY, LATE])
 
 
 def _never_turned(normal: Normal, now: Estimate, change: Array) -> bool:
@@ -205,10 +260,7 @@ def _never_turned(normal: Normal, now: Estimate, change: Array) -> bool:
     """
     back, forth, error = now.turned
     play = abs(forth - back - normal.turned)
-    outweighs = BEHIND_PLAY * abs(float(normal.theta[MASS])) * float(normal.per[MASS]) > abs(
-        float(normal.theta[CONSTANT])
-    )
-    return bool(outweighs and play + 2.0 * error < PUSHED_APART[0] * 2.0 * abs(float(change[PLACE])))
+    return bool(_outweighs(normal) and play + 2.0 * error < PUSHED_APART[0] * 2.0 * abs(float(change[PLACE])))
 
 
 def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -> bool:
@@ -219,14 +271,14 @@ def _without_play(normal: Normal, now: Estimate, change: Array, travel: float) -
     there on is tried by itself: of all sizes at once only their sum shows, and what is too small to show in it hides
     the rest. What is too small for any column is not told apart.
     """
-    return _behind(normal, now, change, travel)[1]
+    return _behind(normal, now, change, travel, 2.0 * abs(float(change[PLACE])))[1]
 
 
-def _behind(normal: Normal, now: Estimate, change: Array, travel: float) -> tuple[bool, bool]:
-    """Say whether reversals of force prove a mass behind the play that a shift of the reference would be, and whether
-    they exclude one behind any play from there on.
+def _behind(normal: Normal, now: Estimate, change: Array, travel: float, play: float) -> tuple[bool, bool]:
+    """Say whether reversals of force prove a mass behind a play, and whether they exclude one behind any play from
+    there on.
     """
-    gap = 2.0 * abs(float(change[PLACE])) / travel
+    gap = play / travel
     if gap <= SMALLEST * PLAYS[0]:
         return False, False
     plays = slice(GAP, GAP + len(PLAYS))
@@ -275,7 +327,11 @@ def _names(left: dict[str, float]) -> tuple[str, ...]:
     order = sorted(kept, key=lambda name: kept[name])
     if not order or kept[order[0]] > LEAVES:
         return ()
-    return tuple(name for name in order if kept[name] < kept[order[0]] + RIVAL)
+    most = kept[order[0]] + RIVAL
+    names = [name for name in order if kept[name] < most]
+    # the simpler one for which a richer one was dropped may itself be no rival of what is best now
+    spoken = {cause.part_of for cause in CAUSES if cause.name in names}
+    return (*names, *(n for n in left if n not in kept and n not in spoken and left[n] < most))
 
 
 def _size(
@@ -288,7 +344,7 @@ def _size(
         return 1.0 / (1.0 + float(along[0])), half / (1.0 + float(along[0])) ** 2
     if cause.name != "backlash":
         return float(along[0]), half
-    play, known = now.theta[PLAY] - normal.theta[PLAY], now.noise[PLAY, PLAY]
+    play, variance = _play(normal, now, now.theta - normal.theta)
     shift, unsure = 2.0 * abs(float(now.theta[PLACE] - normal.theta[PLACE])), now.noise[PLACE, PLACE]
     unsure = 2.0 * float(np.sqrt(unsure + normal.own[PLACE, PLACE]))
     loose = now.loose - (normal.loose if np.isfinite(normal.loose) else 0.0)
@@ -296,7 +352,7 @@ def _size(
         return loose, 1.96 * normal.scatter + YIELDS * loose
     if shift > abs(play) and unsure < TOLD_PLAY * shift:  # one flank bears: hardly ever the other does at steady speed
         return shift, 1.96 * unsure + YIELDS * shift
-    known = float(np.sqrt(known + normal.own[PLAY, PLAY]))
+    known = float(np.sqrt(variance))
     if known < TOLD_PLAY * abs(play):
         return float(play), 1.96 * known
     weight = np.maximum(along[:3], 0.0) * PLAYS

@@ -16,7 +16,7 @@ from .moves import Array
 from .normal import ALL_NAMES, Normal
 from .rows import SIZE
 
-VERSION = 2
+VERSION = 3
 _TOTAL = len(ALL_NAMES)
 _SHAPES: Mapping[str, tuple[int, ...]] = {
     "gram": (SIZE + 1, SIZE + 1), "freed": (SIZE, SIZE), "theta": (_TOTAL,), "own": (_TOTAL, _TOTAL), "per": (SIZE,),
@@ -74,7 +74,7 @@ def _plain(value: Any, offset_s: float) -> dict[str, Any]:
         if isinstance(each, np.ndarray):
             out[field.name] = [float(f"{x:.12g}") for x in each.ravel()]
         elif isinstance(each, tuple) and each and isinstance(each[0], Crossing):
-            out[field.name] = [[c.place, c.way] for c in each]
+            out[field.name] = [[c.place, c.way, c.speed] for c in each]
         elif isinstance(each, float):
             shift = offset_s if field.name in ("start_s", "end_s", "until_s", "since_s", "told_s") else 0.0
             out[field.name] = each + shift if math.isfinite(each) else None
@@ -100,7 +100,7 @@ def _array(table: Mapping[str, Any], name: str) -> Array:
 
 
 def _block(t: Mapping[str, Any], offset_s: float) -> Block:
-    crossings = tuple(Crossing(_number(p), _way(w)) for p, w in list(t["crossings"])[:MOST_CROSSINGS])
+    crossings = tuple(Crossing(_number(p), _way(w), _number(v)) for p, w, v in list(t["crossings"])[:MOST_CROSSINGS])
     return Block(
         _number(t["start_s"]) - offset_s, _number(t["end_s"]) - offset_s, _number(t["motion_s"]), int(t["rows"]),
         _array(t, "gram"), _array(t, "freed"), _maybe(t["least"]), _maybe(t["most"]), _number(t["error"]), crossings,

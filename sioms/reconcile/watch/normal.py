@@ -1,6 +1,7 @@
 """What is normal of an axis: its numbers in the commissioning phase, and how they vary there by themselves.
 
-All vectors have the numbers of ``rows`` and then those of the reference: its place, its scale and the play there.
+All vectors have the numbers of ``rows`` and then those of the reference: its place, its scale, the play there
+and how late it is told [s].
 """
 
 from __future__ import annotations
@@ -25,8 +26,10 @@ from sioms.reconcile.thresholds import (
     IDLE_SHARE,
     IDLE_STEPS,
     MODEL_SHARE,
+    MOST_LATE_S,
     MOST_PLACE,
     MOST_SCALE,
+    SPEED_KNOWN,
     STUDENT,
     UNSEEN,
 )
@@ -35,9 +38,9 @@ from .blocks import Block, solved
 from .moves import Array
 from .rows import CONSTANT, DRY, GAP, MASS, NAMES, SIZE, VISCOUS
 
-ALL_NAMES = (*NAMES, "place", "scale", "play")
+ALL_NAMES = (*NAMES, "place", "scale", "play", "late")
 TOTAL = len(ALL_NAMES)
-PLACE, SCALE, PLAY = SIZE, SIZE + 1, SIZE + 2
+PLACE, SCALE, PLAY, LATE = range(SIZE, SIZE + 4)
 #: Blocks whose numbers together are compared, and the least number of such groups.
 GROUP, LEAST_GROUPS = 6, 10
 #: Numbers by which blocks from before and after a change differ.
@@ -90,7 +93,9 @@ class Estimate:
     A number that no move tells has UNKNOWN, one of the reference that no crossing tells the most that it may be.
     ``left`` is the mean square of force that the model leaves; ``gram`` and ``rows`` are of the blocks. ``turned`` is
     where edges are passed while inertia pushes the load back and forth, off their places, and the standard deviation of
-    the difference; ``loose``: how far apart an edge is passed at steady speeds.
+    the difference; ``by_way``: share of what sets edges apart by the way of the motion that is in it, and ``by_speed``
+    what a reference that is late by a second makes of it. ``loose``: how far apart an edge is passed at steady speeds;
+    ``pace``: root mean square of these.
     """
 
     theta: Array
@@ -100,6 +105,9 @@ class Estimate:
     rows: int
     turned: tuple[float, float, float] = (np.nan, np.nan, np.inf)
     loose: float = np.nan
+    by_way: float = 0.0
+    by_speed: float = 0.0
+    pace: float = np.nan
 
 
 def estimate(
@@ -137,7 +145,15 @@ def estimate(
     apart = max(_apart(blocks, loads, theta[list(FRICTIONS)]) - row, 0.0)
     cover[np.ix_(FRICTIONS, FRICTIONS)] += apart * inverse[np.ix_(few, few)]
     _refer(blocks, edges, scatter, travel, theta, cover)
-    return Estimate(theta, cover, left, gram, rows, _turned(blocks, edges, scatter), _loose(blocks, edges))
+    turned, by_way, by_speed = _turned(blocks, edges, scatter)
+    loose = _loose(blocks, edges)
+    return Estimate(theta, cover, left, gram, rows, turned, loose, by_way, by_speed, _pace(blocks))
+
+
+def _pace(blocks: Sequence[Block]) -> float:
+    """Return the root mean square speed at which edges are passed steadily, NaN where none are."""
+    speeds = [c.speed for b in blocks for c in b.crossings if abs(c.way) == 1]
+    return float(np.sqrt(np.mean(np.square(speeds)))) if speeds else np.nan
 
 
 def _loose(blocks: Sequence[Block], edges: Sequence[float]) -> float:
@@ -155,26 +171,31 @@ def _loose(blocks: Sequence[Block], edges: Sequence[float]) -> float:
     return max((float(side[-2] - side[1]) for side in sides if len(side) >= FEW_STEADY), default=np.nan)
 
 
-def _turned(blocks: Sequence[Block], edges: Sequence[float], scatter: float) -> tuple[float, float, float]:
-    """Return how far off edges are passed while the axis is accelerated backwards and forwards, and the standard
-    deviation of the difference.
+def _turned(
+    blocks: Sequence[Block], edges: Sequence[float], scatter: float
+) -> tuple[tuple[float, float, float], float, float]:
+    """Return how far off edges are passed while the axis is accelerated backwards and forwards, the standard deviation
+    of the difference, and what of a difference by the way, and by the speed, of the motion would be in it.
 
     Inertia then holds the load at one flank or the other, whatever bears at steady speed; a shift of the reference is
     the same for both.
     """
-    pushed = [(c.place, np.sign(c.way)) for b in blocks for c in b.crossings if abs(c.way) == 2]
+    pushed = [(c.place, np.sign(c.way), c.speed) for b in blocks for c in b.crossings if abs(c.way) == 2]
     if not edges or not pushed:
-        return np.nan, np.nan, np.inf
-    places, ways = np.array(pushed, dtype=np.float64).T
+        return (np.nan, np.nan, np.inf), 0.0, 0.0
+    places, ways, speeds = np.array(pushed, dtype=np.float64).T
     off = places - np.array(edges)[np.abs(places[:, None] - np.array(edges)).argmin(axis=1)]
     sides = [off[ways == way] for way in (-1.0, 1.0)]
     if min(map(len, sides)) < FEW_PUSHED:
-        return np.nan, np.nan, np.inf
+        return (np.nan, np.nan, np.inf), 0.0, 0.0
+    by_way, by_speed = (
+        float(np.mean(each[ways == 1.0]) - np.mean(each[ways == -1.0])) for each in (0.5 * np.sign(speeds), speeds)
+    )
     free = sum(map(len, sides)) - 2
     left = float(np.sum(np.concatenate([s - np.mean(s) for s in sides]) ** 2)) / free
     spread = max(float(np.sqrt(left)), scatter) * (1.0 + STUDENT / free)
     back, forth = (float(np.mean(side)) for side in sides)
-    return back, forth, spread * float(np.sqrt(sum(1.0 / len(s) for s in sides)))
+    return (back, forth, spread * float(np.sqrt(sum(1.0 / len(s) for s in sides)))), by_way, by_speed
 
 
 def _apart(blocks: Sequence[Block], loads: bool, together: Array) -> float:
@@ -201,27 +222,29 @@ def _apart(blocks: Sequence[Block], loads: bool, together: Array) -> float:
 def _refer(
     blocks: Sequence[Block], edges: Sequence[float], scatter: float, travel: float, theta: Array, cover: Array
 ) -> None:
-    """Fill in place, scale and play of the reference; what its crossings do not tell apart stays so, by covariance.
+    """Fill in the numbers of the reference; what its crossings do not tell apart stays so, by covariance.
 
-    One edge tells the place and so much times the scale together, crossings in one way the place and half the play.
+    One edge tells the place and so much times the scale together, crossings in one way the place and half the play,
+    crossings at one speed the play and how late the reference is told.
     """
     most = _most(travel)
     cover[SIZE:, SIZE:] = np.diag(most**2)
-    steady = [(c.place, c.way) for b in blocks for c in b.crossings if abs(c.way) == 1]
-    places = np.array(steady, dtype=np.float64).reshape(-1, 2)
+    steady = [(c.place, c.way, c.speed) for b in blocks for c in b.crossings if abs(c.way) == 1]
+    places = np.array(steady, dtype=np.float64).reshape(-1, 3)
     if not edges or len(places) < 4:
         return
     marks = np.array(edges)[np.abs(places[:, :1] - np.array(edges)).argmin(axis=1)]
     off = places[:, 0] - marks
-    x = np.column_stack([np.ones(len(off)), marks, 0.5 * places[:, 1]]) / max(scatter, 1e-12)
+    error = np.sqrt(max(scatter, 1e-12) ** 2 + (SPEED_KNOWN * off) ** 2)
+    x = np.column_stack([np.ones(len(off)), marks, 0.5 * places[:, 1], places[:, 2]]) / error[:, None]
     q, r = np.linalg.qr(np.vstack([x, np.diag(1.0 / most)]))
     back = np.linalg.inv(r)
-    theta[SIZE:] = back @ (q[: len(off)].T @ off) / max(scatter, 1e-12)
+    theta[SIZE:] = back @ (q[: len(off)].T @ (off / error))
     cover[SIZE:, SIZE:] = back @ back.T
 
 
 def _most(travel: float) -> Array:
-    return np.array([MOST_PLACE * travel, MOST_SCALE, MOST_PLACE * travel])
+    return np.array([MOST_PLACE * travel, MOST_SCALE, MOST_PLACE * travel, MOST_LATE_S])
 
 
 def _limits(travel: float) -> Array:
@@ -257,8 +280,10 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
     floor[:SIZE] = IDLE_SHARE * force / np.maximum(per, 1e-300)
     floor[[PLACE, PLAY]] = IDLE_PLACE * travel + IDLE_STEPS * step + scatter
     floor[SCALE] = IDLE_SCALE
+    floor[LATE] = floor[PLAY] / whole.pace if whole.pace > 0.0 else 0.0
     back, forth, _ = whole.turned
     told = np.diag(whole.noise) < _limits(travel)  # what the reference does not tell is nothing by definition
+    told[[PLACE, PLAY, LATE]] |= bool(edges)  # together they are told, for the ways and speeds of these crossings
     unseen = max(0.0, 1.0 - (blocks[-1].end_s - blocks[0].start_s) / DAY_S)
     heat = np.zeros(TOTAL)
     heat[[VISCOUS, DRY]] = HEAT_VISCOUS * theta[VISCOUS], HEAT_DRY * theta[DRY]
@@ -272,21 +297,34 @@ def learn(blocks: Sequence[Block], travel: float, step: float) -> Normal:
 
 def _edges(blocks: Sequence[Block], travel: float, step: float) -> tuple[tuple[float, ...], float]:
     """Return the places of the reference's edges and the scatter of a crossing about its side of an edge."""
-    all_ = sorted((c.place, c.way) for b in blocks for c in b.crossings if abs(c.way) == 1)
+    all_ = sorted((c.place, c.way, c.speed) for b in blocks for c in b.crossings if abs(c.way) == 1)
     if len(all_) < 8:
         return (), 0.0
-    places, ways = np.array([p for p, _ in all_]), np.array([w for _, w in all_])
+    places, ways, speeds = np.array(all_, dtype=np.float64).T
     groups = np.split(np.arange(len(places)), np.flatnonzero(np.diff(places) > ONE_EDGE * travel) + 1)
     edges, left = [], []
     for group in groups:
         if len(group) < 4:
             continue
-        sides = [places[group][ways[group] == way] for way in (-1, 1)]
+        sides = _at_mean_speed([(places[group][on], speeds[group][on]) for on in (ways[group] < 0, ways[group] > 0)])
         means = [float(np.median(side)) for side in sides if len(side)]
         edges.append(float(np.mean(means)))
         left += [side - np.median(side) for side in sides if len(side)]
     scatter = float(np.std(np.concatenate(left))) if left else 0.0
     return tuple(edges), max(scatter, 0.3 * step)
+
+
+def _at_mean_speed(sides: list[tuple[Array, Array]]) -> list[Array]:
+    """Return where an edge is passed either way, as at the mean speed of that way: a late reference tells it the later
+    in place, the faster the axis goes.
+
+    Args:
+        sides: places and speeds of each way.
+    """
+    off = [(p - np.mean(p), v - np.mean(v)) if len(p) else (p, v) for p, v in sides]
+    known = sum(float(v @ v) for _, v in off)
+    late_s = sum(float(p @ v) for p, v in off) / known if known > 0.0 else 0.0
+    return [place - late_s * v for (place, _), (_, v) in zip(sides, off, strict=True)]
 
 
 def _noise(blocks: Sequence[Block], loads: bool, edges: Sequence[float], scatter: float, left: float) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from sioms.reconcile.model import AxisModel
 
 from .axis import About, Drift
+from .causes import OF_REFERENCE
 from .moves import Array
 from .normal import Normal
 from .rows import CONSTANT, DRY, GAP, MASS, VISCOUS
@@ -96,7 +97,7 @@ def propose(about: About, normal: Normal, drift: Drift, gram: Array, gains: Gain
     was, now = normal.theta, normal.theta + drift.finding.change
     needed = _needed(was, now, gram)
     known = [drift.name] if drift.name else list(drift.names)
-    of_force = not known or any(name not in ("place", "scale", "backlash") for name in known)
+    of_force = not known or any(name not in ("place", "scale", "backlash", *OF_REFERENCE) for name in known)
     before = after = 0.0
     fresh = None
     r = 1.0
@@ -150,6 +151,8 @@ def _said(about: About, drift: Drift, gains: Gains | None, offset: float) -> tup
             todo.append("clean and lubricate; look at bearings and guides")
         case "lower force":
             todo.append("look at supply, phases, magnets and the drive's current limit")
+        case "late reference" | "reference hysteresis":
+            todo.append("look at the reference: its sensor and target, filters of the input, how often it is read")
         case "mass":
             todo.append("look at what is mounted; enter its mass in the model")
         case _:
