@@ -12,7 +12,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from sioms.reconcile import rules
+from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
+from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.plausible import physical, size
@@ -54,13 +56,42 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
                 allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
                 yield start.effect, fit, ROUGH if rattles(model) else allowed, None
 
-    return rules.weighed(
-        found,
-        [n for n, others in alike.items() if others],
-        lambda name: searcher.fit(named(model.without_effect(name)), 5),
-        replacements,
-        searcher.loss,
+    return rules.closest(
+        [
+            *rules.weighed(
+                found,
+                [n for n, others in alike.items() if others],
+                lambda name: searcher.fit(named(model.without_effect(name)), 5),
+                replacements,
+                searcher.loss,
+            ),
+            *_for_several(searcher, found),
+        ]
     )
+
+
+def _for_several(searcher: Searcher, found: Found) -> Iterator[Rival]:
+    """Refit with one force in the place of several that it looks like: a law of the speed between two powers is either
+    both of them or one with a power of its own.
+    """
+    lib, model = library(), found.fit.model
+    for other in (n for n in searcher.names if n not in model.effects and lib[n].slot is Slot.FORCE):
+        parts = [n for n in model.effects if n in lib[other].lookalikes and n not in searcher.frozen]
+        if len(parts) < 2:
+            continue
+        bare = model
+        for name in parts:
+            bare = named(bare.without_effect(name))
+        without = searcher.fit(bare, 5)
+        contribution = without.cost - found.fit.cost
+        for start in searcher.screen(without, [other]):
+            if start.gain * without.cost < 0.3 * contribution:
+                continue
+            fit = searcher.searched(searcher.fit(searcher.switched_on(without, start)))
+            if physical(fit, other):
+                _, errors = better(found.losses, searcher.loss(fit))
+                missed = (fit.cost - found.fit.cost) / contribution
+                yield Rival(parts[0], other, missed, AMBIGUOUS, errors, fit.cost / found.fit.cost - 1.0, fit)
 
 
 def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]]) -> tuple[Found, list[Rival]]:

@@ -49,6 +49,7 @@ from sioms.reconcile.thresholds import (
     PLACES_A_PERIOD,
     QUIET,
     REFUTED,
+    REMAINS,
     UNEXPLAINED,
 )
 from sioms.reconcile.timed import as_recorded
@@ -142,6 +143,13 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     if blindly:
         found_here = [_rated(e, nominal, fit.model) for e in found_here]
     open_now = open_rivals if said is Outcome.AMBIGUOUS else []
+    searched_for = [e for e in found_here if e.name not in s.searcher.frozen]
+    # beside a gap the remainder is of bounces, which no other effect can be
+    doubtful = [] if rattles(found.fit.model) else [e.name for e in searched_for if doubted(e, ratio)]
+    if doubtful and said in (Outcome.NAMED, Outcome.AMBIGUOUS):
+        said = Outcome.AMBIGUOUS
+        others_said = (*others_said, tuple(e.name for e in found_here if e.name not in doubtful))
+        notes.append(_of_doubts([e.title for e in found_here if e.name in doubtful]))
     places, spectrum, traces = _pictures(ready, nominal, found.fit.model, o, rng)
     return AxisVerdict(
         outcome=said,
@@ -170,6 +178,23 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         states=tuple((r.name, q) for r, q in zip(ready.final.session.records, states, strict=True)),
         rejected=s.rejected,
         others=tuple(q.fit.model.effects for q in open_now),
+    )
+
+
+def doubted(effect: NamedEffect, ratio: float) -> bool:
+    """Say whether an effect explains less than what remains above the noise: it may have taken a part of that.
+
+    Args:
+        ratio: of what remains to the noise.
+    """
+    explained = ratio**2 * effect.saved / max(1.0 - effect.saved, 1e-300)
+    return ratio > AXIS.floor and explained < REMAINS * (ratio**2 - 1.0)
+
+
+def _of_doubts(titles: Sequence[str]) -> str:
+    return (
+        f"{' and '.join(titles)}: less is explained by it than remains above the noise, so it may be a part of what "
+        "remains; the model without it is as likely"
     )
 
 

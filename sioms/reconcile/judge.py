@@ -17,7 +17,16 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.free import Freely
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.thresholds import FREE_FLOORS, FREE_LEAST, FREE_NEAR, FREE_SHARE, GIVEN_POWER, STUCK, WORSE
+from sioms.reconcile.thresholds import (
+    CLIPPED,
+    FREE_FLOORS,
+    FREE_LEAST,
+    FREE_NEAR,
+    FREE_SHARE,
+    GIVEN_POWER,
+    STUCK,
+    WORSE,
+)
 from sioms.reconcile.verdict import Gap
 
 FORCE_LOOP = "force, closed loop"
@@ -126,7 +135,28 @@ def _impossible(problem: Problem, model: AxisModel, free: Sequence[Freely]) -> l
             f"the corrected model gains energy from its own motion ({100 * given:.0f} % of what friction of the rated "
             "force would take): what opposes motion cannot drive it"
         )
+    if (clipped := less_than_none(problem, model)) > CLIPPED:
+        out.append(
+            f"the dry friction of the corrected model would be less than none in {100 * clipped:.0f} % of the motion: "
+            "what lowers it takes more than there is"
+        )
     return out
+
+
+def less_than_none(problem: Problem, model: AxisModel) -> float:
+    """Return the share of the samples in motion in which the levels of dry friction add up to less than none."""
+    laws = [(known()[n], given) for n, given in model.effects.items() if known()[n].slot is Slot.FRICTION]
+    if not laws:
+        return 0.0
+    levels, speeds = [], []
+    for r, run in zip(problem.session.records, problem.runs(model), strict=True):
+        state = run.x, run.v, run.applied, run.temperature
+        parts = (effect.evaluate(*state, effect.row(effect.values(given), model.pitch)) for effect, given in laws)
+        levels.append(sum(parts, np.zeros(len(r))))
+        speeds.append(np.abs(run.v))
+    level, speed = problem.join(levels), problem.join(speeds)
+    moving = speed > ONE_WAY * float(np.max(speed))
+    return float(np.mean(level[moving] < 0.0)) if np.any(moving) else 0.0
 
 
 def power_given(problem: Problem, model: AxisModel) -> float:

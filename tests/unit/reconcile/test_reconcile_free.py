@@ -13,7 +13,7 @@ from sioms.reconcile.fit import Problem
 from sioms.reconcile.floor import ON_MODEL, closed_floor
 from sioms.reconcile.free import freely
 from sioms.reconcile.gaps import free_gaps, measure
-from sioms.reconcile.judge import Judgement, judge, power_given
+from sioms.reconcile.judge import Judgement, judge, less_than_none, power_given
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import observer
 from sioms.reconcile.records import Record, Session
@@ -149,3 +149,16 @@ def test_energy_from_nowhere_is_refused() -> None:
     # what depends on the place alone gives back what it takes
     unstable = AXIS.with_effect("spring", {"k": -0.1})
     assert power_given(problem, unstable) == pytest.approx(power_given(problem, AXIS))
+
+
+def test_dry_friction_that_would_be_less_than_none_is_refused() -> None:
+    """What lowers friction as the axis runs in cannot take more than there is: cut off, it bends another law."""
+    problem = looped(AXIS.with_effect("coulomb", {"Fc": 0.05}), 1e-3)
+    ran_in = AXIS.with_effect("warming_friction", {"g": -2e-3, "tau": 1.0})
+    beside = ran_in.with_effect("coulomb", {"Fc": 0.05})
+    assert less_than_none(problem, AXIS) == 0.0 == less_than_none(problem, beside)
+    assert less_than_none(problem, ran_in) > 0.9
+    below = ran_in.with_effect("load_friction", {"mu": 0.02})
+    assert less_than_none(problem, below) > 0.1
+    assert any("less than none" in r for r in judged(problem, AXIS, below).refusals)
+    assert not any("less than none" in r for r in judged(problem, AXIS, beside).refusals)

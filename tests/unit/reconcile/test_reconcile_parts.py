@@ -212,6 +212,18 @@ def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> No
     assert not any(r.open for r in others)
 
 
+def test_one_law_of_the_speed_may_be_what_was_told_as_two() -> None:
+    """Between the powers one and two, viscous friction and quadratic drag together come near one drag."""
+    s = Searcher(
+        problem(session(AXIS.with_effect("power_drag", {"c": 2e-3, "n": 1.5}))),
+        names=("viscous", "quadratic_drag", "power_drag"),
+    )
+    fit = s.fit(AXIS.with_effect("viscous", {"b_extra": 4e-3}).with_effect("quadratic_drag", {"c": 2e-4}))
+    found, others = settle(s, Found(fit, s.loss(fit), ()), ())
+    assert set(found.fit.model.effects) == {"power_drag"} and not others
+    assert found.fit.model.effects["power_drag"]["n"] == pytest.approx(1.5, rel=0.01)
+
+
 def test_a_power_near_none_is_dry_friction() -> None:
     """At its least exponent a drag stands for Coulomb friction, and is no confounder of it at one speed."""
     assert leans(AXIS.with_effect("power_drag", {"c": 0.1, "n": 0.3}), "power_drag")
