@@ -318,6 +318,8 @@ def serve(a: Loop, i: int, dt: float) -> int:
         a.error[i] = 0.0
         a.integral[i] = 0.0
         a.asked[i] = a.desired[i]
+        if abs(a.velocity[i]) > REST * a.velocity_limit[i]:
+            a.moved_ns[i] = a.seen_ns
     else:
         old = a.error[i]
         error = a.desired[i] - a.position[i]

@@ -35,15 +35,16 @@ def look_at_state(s: Plans, i: int, now_ns: int) -> int:
     """Set ``state`` to that in which a command of an axis begins at now, as ``Sequencer._end_state`` finds it."""
     look_at_plan(s, i, now_ns)
     if is_behind(s.loop, i):
-        look_at_late(s, i)
+        look_at_late(s, i, now_ns)
     return 0
 
 
 @step
-def look_at_late(s: Plans, i: int) -> int:
+def look_at_late(s: Plans, i: int, now_ns: int) -> int:
     """Set ``state`` to that of an axis that cannot follow: where it is, no farther ahead than its force reaches."""
     a = s.loop
-    position = a.slewed[i] if a.stepper[i] else a.position[i]
+    beside_s = (now_ns - max(a.last_ns, a.seen_ns)) * 1e-9
+    position = a.slewed[i] if a.stepper[i] else a.position[i] + a.velocity[i] * beside_s
     ahead = s.state[0] - position
     reach = abs(ahead)
     gain = a.k[i] * (1.0 + a.kz[i])
@@ -61,6 +62,7 @@ def begin(s: Plans, i: int, now_ns: int) -> int:
     """Begin the plan in the other row of an axis at now; return whether a command of its owner has ended by that."""
     a = s.loop
     kind = a.kind[i]
+    late = is_behind(a, i)
     row = s.row[i] ^ 1
     s.row[i] = row
     s.start_ns[i] = now_ns
@@ -69,6 +71,8 @@ def begin(s: Plans, i: int, now_ns: int) -> int:
     a.segment_ns[i] = now_ns
     s.cut_ns[i] = UNCUT_NS
     load(s, i)
+    if late and not a.stepper[i]:  # how far it was behind before must not push back
+        a.error[i] = a.present[i] - (a.position[i] + a.velocity[i] * ((now_ns - max(a.last_ns, a.seen_ns)) * 1e-9))
     a.kind[i] = s.row_kind[row]
     a.begun[i] += 1
     s.outcome[i] = 0

@@ -27,6 +27,8 @@ from .axis_step import REST, REST_NS
 
 LONGEST_NS, BACK_NS = 1_000_000_000, 100_000_000
 """So long an axis is bounded at most, and while it goes back [ns]."""
+RELIEFS = 5
+"""So often an axis that is driven back is relieved of what drives it, by half; the last time of all."""
 
 
 class ForceEnds:
@@ -50,6 +52,11 @@ class ForceEnds:
         self._forced = np.zeros(n, dtype=bool)
         self._since_ns = np.zeros(n, dtype=np.int64)
         self._ahead_ns = np.zeros(n, dtype=np.int64)
+        self._kept = np.zeros(n)
+        """Signs of the forces against their motion that stopped axes have kept; 0: none, or at rest."""
+        self._back = np.zeros(n)
+        self._reliefs = np.zeros(n, dtype=np.int64)
+        self._went_ns = np.zeros(n, dtype=np.int64)
 
     def begin(self, axis: int, velocity: float, limit: float, offset: float) -> None:
         """Bound the output of an axis that leaves force mode.
@@ -74,10 +81,40 @@ class ForceEnds:
         self.asked[axis], self._forced[axis] = math.nan, False
         self.any = True
 
+    def keep(self, axes: NDArray[np.int64], signs: NDArray[np.float64]) -> None:
+        """Note that axes, which move, are stopped with a force against their motion, of these signs (m,)."""
+        self._kept[axes], self._back[axes], self._went_ns[axes], self._reliefs[axes] = signs, 0.0, 0, 0
+        self.any = self.any or axes.size > 0
+
     def end(self, axes: NDArray[np.int64]) -> None:
         """Lift the bounds of axes: they are at rest, or have been given a command."""
-        self._direction[axes], self.asked[axes] = 0.0, math.nan
-        self.any = bool(self._direction.any())
+        self._direction[axes], self.asked[axes], self._kept[axes] = 0.0, math.nan, 0.0
+        self.any = bool(self._direction.any() or self._kept.any())
+
+    def turned(
+        self, velocity: NDArray[np.float64], limit: NDArray[np.float64], reach: NDArray[np.float64], now_ns: int
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:  # fmt: skip
+        """Return the axes that the force which they have kept drives back, ever faster: it carries nothing, or less;
+        and which part of it each is to keep still: half of it, and at last nothing.
+
+        Args:
+            velocity: measured (n,).
+            limit: of the velocity (n,).
+            reach: from the axes to what they are driven to, as far as that matters (n,) [unit].
+            now_ns: instant of the tick.
+        """
+        kept = self._kept != 0.0
+        back = velocity * self._kept
+        found = np.flatnonzero((self._kept * reach > 0.0) & (back > REST * limit) & (back > self._back))
+        self._back[:] = back
+        self._reliefs[found] += 1
+        part = np.where(self._reliefs[found] < RELIEFS, 0.5, 0.0)
+        self._kept[found[part == 0.0]] = 0.0
+        moves = kept & ((np.abs(velocity) > REST * limit) | (self._went_ns == 0))
+        self._went_ns[moves] = now_ns
+        self._kept[kept & (now_ns - self._went_ns > REST_NS)] = 0.0
+        self.any = bool(self._direction.any() or self._kept.any())
+        return found, part
 
     def is_bound(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Tell which axes are bounded: they have not come to rest yet."""
@@ -87,6 +124,13 @@ class ForceEnds:
     def has_left(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Tell which axes are bounded because they have left force mode."""
         return self.is_bound(axes) & self._forced[axes]
+
+    def goes_on(
+        self, axes: NDArray[np.int64], velocity: NDArray[np.float64], limit: NDArray[np.float64]
+    ) -> NDArray[np.bool_]:
+        """Tell which axes go on in the direction in which they are bounded, by velocities and their limits (n,)."""
+        along: NDArray[np.bool_] = velocity[axes] * self._direction[axes] > REST * limit[axes]
+        return along
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return what the law bounds outputs by, by the names of its fields."""

@@ -432,13 +432,40 @@ class AxisBank(Bank):
             self._abandon(np.array([axis]), now_ns, errno.EPIPE, f"marker {number} was freed while waited for")
 
     def _yield(self) -> None:
-        """Hold where they are the axes that would have to press harder than they were told to reach their set-point."""
-        law = self._law
+        """Have the set-points come to the axes that would have to press harder than they were told to reach them.
+
+        There they are held, after a force command that may carry something with that force. An axis that goes on in
+        that direction, and that is braked by what resists it harder than by its ramp, is braked from there: a set-point
+        that stands at once would be a stop at any deceleration.
+        """
+        law, sequencer = self._law, self._sequencer
         axes = law.force_ends.look(self._velocity, law.velocity_limit, self._last_ns)
         if axes.size:
             law.give_way(axes)
-            self._sequencer.hold(axes, self._position[axes], self._last_ns)
-            self._desired[axes], self._desired_velocity[axes] = self._position[axes], 0.0
+            goes_on = law.force_ends.goes_on(axes, self._velocity, law.velocity_limit)
+            held, moving = axes[~goes_on], axes[goes_on]
+            place = self._position[axes]
+            if held.size:
+                left = law.force_ends.has_left(axes) & ~goes_on
+                place[left] += law.hold_load(axes[left])
+                sequencer.hold(held, place[~goes_on], self._last_ns)
+            if moving.size:
+                state = np.stack((self._position[moving], self._velocity[moving]), axis=1)
+                sequencer.brake(moving, state, self._last_ns, sequencer.hardest(moving))
+            self._desired[axes], self._desired_velocity[axes] = place, np.where(goes_on, self._velocity[axes], 0.0)
+        turned, part = law.force_ends.turned(
+            self._velocity, law.velocity_limit, law.drive(self._desired), self._last_ns
+        )
+        if turned.size:
+            place = self._position[turned] + law.relieve(turned, part)
+            rests = sequencer.kind[turned] == HOLD
+            if rests.any():
+                sequencer.hold(turned[rests], place[rests], self._last_ns)
+            if not rests.all():
+                moving = turned[~rests]
+                state = np.stack((place[~rests], self._velocity[moving]), axis=1)
+                sequencer.brake(moving, state, self._last_ns, sequencer.hardest(moving))
+            self._desired[turned] = place
         letting_go = np.flatnonzero(self._lets_go)
         if letting_go.size:
             self._set_limp(letting_go[~law.force_ends.is_bound(letting_go)])

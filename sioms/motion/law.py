@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from sioms.native.language import ARRAYS
 
-from .axis_step import FORCE, REST, Loop
+from .axis_step import FORCE, REST, REST_NS, Loop
 from .force_end import ForceEnds
 from .settings import AxisKind, AxisSettings
 from .store import NEVER_NS
@@ -230,15 +230,52 @@ class ControlLaw:
         chosen, velocity, moves = chosen[servo], velocity[servo], moves[servo]
         output, offset = self.output[chosen], self.offset[chosen]
         limit = self.force_limit[chosen]
-        output = np.where(moves & ((output - offset) * velocity > 0.0), offset, np.clip(output, -limit, limit))
-        gain = self.k[chosen] * (1.0 + self.kz[chosen])
-        wish = output * (1.0 + self.kp[chosen]) - offset - self.kb[chosen] * velocity
-        carries = self._carries(chosen)
-        self._integral[chosen[carries]] = wish[carries]
-        lead = np.divide(wish, gain, out=np.zeros(len(chosen)), where=(gain > 0.0) & ~carries)
-        self._error[chosen] = lead
-        position[np.flatnonzero(tuned)[servo]] += lead
+        along = (output - offset) * velocity
+        output = np.where(moves & (along > 0.0), offset, np.clip(output, -limit, limit))
+        opposes = moves & (along < 0.0)
+        self.force_ends.keep(chosen[opposes], -np.sign(velocity[opposes]))
+        position[np.flatnonzero(tuned)[servo]] += self._go_on(chosen, output, velocity)
         return position
+
+    def hold_load(self, axes: NDArray[np.int64]) -> Vector:
+        """Have servos that leave force mode at rest go on with their force, which may carry something; return how far
+        beside the axes their set-points are then (m,).
+
+        Others, and those that would need it farther away than an axis may be behind, hold with none. So do those that
+        have not been at rest for a while: nothing need bear a force that has just begun.
+        """
+        lead = np.zeros(len(axes))
+        bears = self.loop.seen_ns - self.moved_ns[axes] > REST_NS
+        rests = np.flatnonzero(bears & ~self.moves(axes) & ~self.stepper[axes] & ~self.limp[axes])
+        chosen = axes[rests]
+        lead[rests] = self._go_on(chosen, self.output[chosen], self._velocity[chosen])
+        far = np.abs(lead) > self._error_max[axes]
+        lead[far] = self._error[axes[far]] = 0.0
+        return lead
+
+    def drive(self, desired: Vector) -> Vector:
+        """Return how far axes are from set-points to which their outputs drive them (n,); 0: near, or driven away."""
+        reach = desired - self._position
+        driven = ((self.output - self.offset) * reach > 0.0) & (np.abs(reach) > self._tolerance)
+        return np.where(driven, reach, 0.0)
+
+    def relieve(self, axes: NDArray[np.int64], part: Vector) -> Vector:
+        """Have servos go on with a part (m,) of the force beside their offset; return how far beside them their
+        set-points are then (m,).
+        """
+        self.give_way(axes)
+        offset = self.offset[axes]
+        return self._go_on(axes, offset + part * (self.output[axes] - offset), self._velocity[axes])
+
+    def _go_on(self, axes: NDArray[np.int64], output: Vector, velocity: Vector) -> Vector:
+        """Have servos go on with an output at their velocities; return how far beside them set-points are then (m,)."""
+        gain = self.k[axes] * (1.0 + self.kz[axes])
+        wish = output * (1.0 + self.kp[axes]) - self.offset[axes] - self.kb[axes] * velocity
+        carries = self._carries(axes)
+        self._integral[axes[carries]] = wish[carries]
+        lead: Vector = np.divide(wish, gain, out=np.zeros(len(axes)), where=(gain > 0.0) & ~carries)
+        self._error[axes] = lead
+        return lead
 
     def _carries(self, axes: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Tell which axes hold their load by the integral of their error, which would lead them to their set-points."""
@@ -273,6 +310,19 @@ class ControlLaw:
         position = np.where(stepper, self.slewed[axes], self._position[axes])
         velocity = np.where(stepper, self.output[axes], self._velocity[axes])
         return position + velocity * self._since_tick(now_ns), velocity
+
+    def place_at(self, axes: NDArray[np.int64], at_ns: NDArray[np.int64]) -> Vector:
+        """Return where axes are at instants (m,) near the last tick, also just before its readings: of steppers where
+        they were put by then.
+        """
+        beside_s = (at_ns - max(self.loop.last_ns, self.loop.seen_ns)) * 1e-9
+        moved: Vector = self._position[axes] + self._velocity[axes] * beside_s
+        return np.where(self.stepper[axes], self.slewed[axes], moved)
+
+    def begin_at(self, axes: NDArray[np.int64], places: Vector, at_ns: NDArray[np.int64]) -> None:
+        """Note that axes that could not follow begin at places (m,): how far they were behind must not push back."""
+        servos = ~self.stepper[axes]
+        self._error[axes[servos]] = (places - self.place_at(axes, at_ns))[servos]
 
     def _since_tick(self, now_ns: int) -> float:
         """Return how long the last tick is past at now_ns [s]; its readings may have come with none yet done."""

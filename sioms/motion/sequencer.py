@@ -253,7 +253,9 @@ class Sequencer:
             most[measured] = self._hardest[axes[measured]]
             state[tuned, 1] = law.actual(axes[tuned])[1]
             state[tuned, 0] = law.brace(axes, seen_ns)[tuned]
-            state[tuned, 0] -= self._beyond(axes[tuned], state[tuned], most[tuned], seen_ns)
+            state[pressing, 0] += law.hold_load(axes[pressing])
+            beside = tuned | pressing
+            state[beside, 0] -= self._beyond(axes[beside], state[beside], most[beside], seen_ns)
         if behind.any():
             late = axes[behind]
             state[behind, 0], state[behind, 1] = law.actual(late, seen_ns)
@@ -323,20 +325,28 @@ class Sequencer:
         """Return the set-point state (m, 3) at now; of axes in force mode the measured one."""
         return self._actual_of_force(axes, self.store.state(axes, now_ns), now_ns)
 
-    def _end_state(self, axes: Axes, now_ns: int) -> Floats:
-        """Return the state (m, 3) in which what follows the plans that have just ended begins."""
+    def _end_state(self, axes: Axes, at_ns: NDArray[np.int64], now_ns: int) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the state (m, 3) in which what follows the plans that have just ended begins, and who cannot follow.
+
+        Args:
+            axes: whose plans.
+            at_ns: when these have ended (m,).
+            now_ns: when all that is due has been done.
+        """
         store, law = self.store, self._law
         state = self._actual_of_force(axes, store.final[store.row[axes]], now_ns)
         broken = np.flatnonzero(store.cut_ns[axes] != UNCUT_NS)
         behind = broken[law.is_behind(axes[broken])] if broken.size else broken
+        is_late = np.zeros(len(axes), dtype=bool)
         if behind.size:
             late = axes[behind]
-            position, velocity = law.actual(late)
+            is_late[behind] = True
+            position, velocity = law.place_at(late, at_ns[behind]), law.actual(late)[1]
             reach = np.minimum(np.abs(state[behind, 0] - position), law.full_error(late))
             state[behind, 0] = position + np.copysign(reach, state[behind, 0] - position)
             state[behind, 1], state[behind, 2] = velocity, 0.0
             self._ready[late] = False  # what was planned ahead would begin somewhere else
-        return state
+        return state, is_late
 
     def _actual_of_force(self, axes: Axes, state: Floats, now_ns: int) -> Floats:
         if self.any_force:
@@ -366,7 +376,7 @@ class Sequencer:
         store, queue = self.store, self._queue
         rows = store.row[axes]
         start_ns, fraction = store.ended_at(axes)
-        state = self._end_state(axes, now_ns)
+        state, late = self._end_state(axes, start_ns, now_ns)
         kind = self._row_kind[rows]
         queue.emit(EventKind.ENDED, axes[(kind >= POSITION) & (kind <= FORCE)], now_ns)
         for row in rows[self._row_signals[rows]].tolist():
@@ -379,6 +389,8 @@ class Sequencer:
             p, v, a = begins[i].tolist()
             self._plan_head(int(axes[i]), (p, v, a), now_ns)
         go = free & self._ready[axes]
+        if (late & go).any():
+            self._law.begin_at(axes[late & go], begins[late & go, 0], start_ns[late & go])
         if go.all():
             self._start(axes, start_ns, fraction, now_ns)
         else:
@@ -463,6 +475,7 @@ class Sequencer:
         pressing = axes[self.kind[axes] == FORCE]
         if pressing.size:
             self._law.speed_most[pressing] = self._limits.velocity[pressing]
+            self._law.moved_ns[pressing] = now_ns
         self.guard[axes] = self._row_guard[rows]
         self.outcome[axes] = 0
         self.stopped[axes] = False

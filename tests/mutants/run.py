@@ -18,6 +18,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 TREE = Path(__file__).resolve().parents[2]
+STARTED = ("daemon/", "drivers/", "sioms/gateway/", "sioms/motion/", "sioms/sdk/")
+"""What tests of processes start from the tree that is installed, which is not the copy with the fault."""
 LONGEST_S = 600.0
 """A mutant whose tests take longer hangs: that is a find, too."""
 
@@ -37,6 +39,16 @@ def mutants() -> list[Mutant]:
     with open(Path(__file__).with_name("mutants.toml"), "rb") as file:
         data = tomllib.load(file)
     return [Mutant(**{**table, "tests": data["tests"][table["tests"]]}) for table in data["mutant"]]
+
+
+def unseen(mutant: Mutant) -> str:
+    """Return why none of its tests can find a fault; '': one may."""
+    if not mutant.file.startswith(STARTED) or any(not test.startswith("tests/process/") for test in mutant.tests):
+        return ""
+    return (
+        f"{mutant.name}: its tests are of processes, which are started from the installed tree, not from the copy "
+        f"of {mutant.file}; want a test that imports it"
+    )
 
 
 def copy_tree(to: Path) -> None:
@@ -80,6 +92,9 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("names", nargs="*", help="parts of their names")
     options = parser.parse_args(arguments)
     chosen = [m for m in mutants() if not options.names or any(name in m.name for name in options.names)]
+    if why := "\n".join(filter(None, map(unseen, chosen))):
+        print(why)
+        return 1
     trees: queue.Queue[Path] = queue.Queue()
     with (
         tempfile.TemporaryDirectory(prefix="sioms-mutants-") as folder,

@@ -22,6 +22,14 @@ def test_each_mutant_changes_one_place() -> None:
         assert all((RUN.TREE / test.partition("::")[0]).is_file() for test in mutant.tests), mutant.name
 
 
+def test_no_fault_is_looked_for_where_it_is_not() -> None:
+    assert [why for mutant in RUN.mutants() if (why := RUN.unseen(mutant))] == []
+    one = RUN.Mutant("m", "daemon/stops.py", "a", "b", ["tests/process/test_stops.py", "tests/process/test_deaths.py"])
+    assert "want a test that imports it" in RUN.unseen(one)
+    assert not RUN.unseen(one._replace(file="sioms/client/channel.py"))
+    assert not RUN.unseen(one._replace(tests=[*one.tests, "tests/unit/daemon/test_stops.py"]))
+
+
 def test_there_are_fifty_of_them_and_no_two_alike() -> None:
     found = RUN.mutants()
     assert len(found) >= 50

@@ -5,17 +5,23 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterator
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from sioms.daemon import requests as requests_module
 from sioms.daemon.cell import Cell
 from sioms.daemon.log import Log
+from sioms.daemon.requests import Requests
+from sioms.daemon.stop_record import StopRecord
 from sioms.daemon.stops import Stops
 from sioms.part_times import PartTimes
+from sioms.protocol import verbs
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.stopfile import SOMEBODY, StopRequest
+from sioms.protocol.stopjournal import StopJournal, node_entry
 
 PID = 4711
 
@@ -117,3 +123,71 @@ def test_one_device_of_each_process_is_told_of_a_stop_and_one_that_listens(rig: 
     assert max(device.told for device in devices) == 1
     rig.stops.stopped(devices[2], "an input")  # type: ignore[arg-type]
     assert [device.told for device in devices] == [0, 1, 0, 2, 2, 2, 0], "its own process has seen it"
+
+
+class Told:
+    """A driver that is there, and what it is told."""
+
+    name, is_there, lives_in, trouble = "mod0", True, "mod0", ""
+
+    def __init__(self) -> None:
+        self.orders: list[Any] = []
+
+    def send(self, message: Any) -> None:
+        self.orders.append(message)
+
+
+def _node(rig: Rig, *channels: int) -> Any:
+    """Return a node of these channels of a device that is there."""
+    blocks = [SimpleNamespace(name="", channels=[SimpleNamespace(width=0)] * 2)]
+    rig.cell.names = SimpleNamespace(devices={"mod0": SimpleNamespace(blocks=blocks)})  # type: ignore[assignment]
+    rig.cell.devices = {"mod0": Told()}  # type: ignore[dict-item]
+    rig.cell.shared.record.state.entries = list
+    rig.cell.shared.record.note = lambda entry: None  # type: ignore[method-assign]
+    return SimpleNamespace(name="mod0.x", device="mod0", block=0, channels=list(channels), bit=-1)
+
+
+def test_a_stop_of_a_node_is_younger_than_a_reset_that_was_sent_before(rig: Rig) -> None:
+    x, y = _node(rig, 0), _node(rig, 1)
+    sent_ns = time.monotonic_ns()
+    rig.stops.stop_node(x, "eva", 1)
+    assert rig.stops.stopped_since(sent_ns, 2, x), "of this node"
+    assert rig.stops.stopped_since(sent_ns, 2), "of the workcell, and with it of this node"
+    assert not rig.stops.stopped_since(sent_ns, 2, y), "of another one"
+    assert not rig.stops.stopped_since(sent_ns, 1, x), "by who has stopped it"
+    assert not rig.stops.stopped_since(time.monotonic_ns(), 2, x), "afterwards"
+
+
+def test_who_resets_what_he_has_stopped_has_sent_it_after_that(rig: Rig) -> None:
+    node, sent_ns = _node(rig, 0), time.monotonic_ns()
+    rig.stops.stop_node(node, "eva", 1)
+    for by, is_later in ((1, True), (2, False)):
+        rig.stops.reset_node(node, "eva", sent_ns, by)
+        order = rig.cell.devices["mod0"].orders[-1]  # type: ignore[attr-defined]
+        assert (order.sent_ns > sent_ns) is is_later
+
+
+def test_stops_that_drivers_have_noted_have_been_asked_for(tmp_path: Path) -> None:
+    record = StopRecord(str(tmp_path / "stops"))
+    driver = StopJournal(os.dup(record.drivers_fd))
+    at_ns = time.monotonic_ns()
+    driver.append(node_entry("mod0", "mod0", "", [(0, 0)], "eva", stop=True, pid=PID, at_ns=at_ns), time.time())
+    record.look()
+    assert record.asked.latest_ns(("mod0", ""), {0: 1}, 0) == at_ns
+    record.close()
+    driver.close()
+
+
+def test_what_lay_in_a_socket_before_it_was_stamped_is_as_old_as_can_be() -> None:
+    served: list[int] = []
+    session = SimpleNamespace(sock=SimpleNamespace(), early_bytes=5, timestamp_ns=-1, waits={})
+    requests: Any = SimpleNamespace(
+        _clients=SimpleNamespace(sessions=[session]), _dispatch=lambda session, *_: served.append(session.timestamp_ns)
+    )
+    packet = verbs.List().packed(1)
+    session.early_bytes = len(packet) + 1
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(requests_module, "receive", lambda sock, most: (packet, 77))
+        for _ in range(3):
+            Requests.receive(requests, session)  # type: ignore[arg-type]
+    assert served == [0, 0, 77]

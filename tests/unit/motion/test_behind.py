@@ -211,3 +211,30 @@ def test_who_may_use_all_the_force_has_to_follow() -> None:
         if faulty:
             assert "following error 0.25" in rig.bank.fault_text(0)
             assert rig.field("force") == 0.0
+
+
+@pytest.mark.parametrize("others", (0, 7))
+@pytest.mark.parametrize("since_ns", (0, 400_000, 900_000))
+def test_what_replaces_a_motion_that_could_not_be_followed_is_no_kick(since_ns: int, others: int) -> None:
+    """However far behind the axis was, and whenever between two ticks; more axes than a few go a way of their own."""
+    plant = Mass(mass=2.0, viscous=4.0)
+    idle = [axis(**{**WEAK, "k": 400.0}) for _ in range(others)]
+    changes = {
+        "k": 20000.0,
+        "kz": -0.9,
+        "kb": -40.0,
+        "force_max": 6.0,
+        "acceleration_max": 5.0,
+        "following_error_max": np.inf,
+    }
+    rig = Rig(
+        [axis(**{**WEAK, **changes}), *idle], plant=lambda force, dt: np.append(plant(force, dt), np.zeros(others))
+    )
+    rig.write(mode=VELOCITY, velocity=0.5)
+    rig.tick(80)
+    assert rig.field("following_error") > 0.003 and rig.field("force") == 6.0
+    before, rig.now_ns = len(rig.history), rig.now_ns + since_ns
+    rig.write(mode=VELOCITY, velocity=np.append(0.2, np.zeros(others)), axis=np.arange(others + 1), replace=True)
+    rig.now_ns -= since_ns
+    rig.tick(40)
+    assert rig.trace("force")[before:].min() > -1.0
