@@ -64,7 +64,7 @@ class Approach(NamedTuple):
         if not lowest <= begin <= highest:
             raise InfeasibleError(
                 f"position {target:g} is approached from {begin:g}, which is outside the soft limits; "
-                f"{lowest:g} to {highest:g}"
+                f"want {lowest:g} to {highest:g}"
             )
         return begin
 

@@ -173,7 +173,7 @@ class Validator:
         bad = (local < 0) | (local >= len(axes))
         if bad.any():
             i = int(bad.argmax())
-            raise RecordError(errno.EINVAL, "", i, f"axis {local[i]} does not exist; 0 to {len(axes) - 1}")
+            raise RecordError(errno.EINVAL, "", i, f"axis {local[i]} does not exist; want 0 to {len(axes) - 1}")
         placed: NDArray[np.int64] = axes[local]
         return placed
 
@@ -223,7 +223,7 @@ class Validator:
                 errno.EINVAL,
                 commands,
                 int(bad.argmax()),
-                "this axis cannot pass a position at a velocity; POSITION or VELOCITY alone",
+                "this axis cannot pass a position at a velocity; want POSITION or VELOCITY alone",
             )
         missing = mode & ~self._modes[commands["axis"]]
         if missing.any():
@@ -247,7 +247,7 @@ class Validator:
             bad = held & ~np.isfinite(value)
             if bad.any():
                 i = int(bad.argmax())
-                raise self.refuse(errno.EINVAL, commands, i, f"{rule.field} is {value[i]}; a finite number")
+                raise self.refuse(errno.EINVAL, commands, i, f"{rule.field} is {value[i]}; want a finite number")
             if rule.bound:
                 bound = getattr(self._limits, rule.bound)[axis]
                 bad = held & ((np.abs(value) > bound) | (rule.positive & (value <= 0)))
@@ -268,7 +268,7 @@ class Validator:
                     errno.ERANGE,
                     commands,
                     i,
-                    f"kp {commands['kp'][i]} makes the law unstable; between -1 and 1",
+                    f"kp {commands['kp'][i]} makes the law unstable; want between -1 and 1",
                 )
 
     def _out_of_range(self, commands: NDArray[Any], i: int, rule: Rule, bound: NDArray[np.float64]) -> RecordError:
@@ -279,7 +279,7 @@ class Validator:
             errno.ERANGE,
             commands,
             i,
-            f"{rule.field} {commands[rule.field][i]:g} {unit} is outside the limits; {low} to {bound[i]:g} {unit}",
+            f"{rule.field} {commands[rule.field][i]:g} {unit} is outside the limits; want {low} to {bound[i]:g} {unit}",
         )
 
     def _check_time(self, commands: NDArray[Any]) -> None:
@@ -297,7 +297,7 @@ class Validator:
                 errno.EINVAL,
                 commands,
                 i,
-                f"time {time[i]:g} s; more than 0 and at most {most} s, or negative for "
+                f"time {time[i]:g} s; want more than 0 and at most {most} s, or negative for "
                 "'until the next command' (not with a position that is passed)",
             )
 
@@ -309,7 +309,7 @@ class Validator:
         bad = held & ~np.isfinite(value)
         if bad.any():
             i = int(bad.argmax())
-            raise self.refuse(errno.EINVAL, commands, i, f"position is {value[i]}; a finite number")
+            raise self.refuse(errno.EINVAL, commands, i, f"position is {value[i]}; want a finite number")
         low, high = self._limits.reach(axis, mode)
         bad = held & ((mode & int(M.RELATIVE)) == 0) & ((value < low) | (value > high))
         if bad.any():
@@ -319,7 +319,7 @@ class Validator:
                 errno.ERANGE,
                 commands,
                 i,
-                f"position {value[i]:g} {unit} is outside the soft limits; {low[i]:g} to {high[i]:g} {unit}"
+                f"position {value[i]:g} {unit} is outside the soft limits; want {low[i]:g} to {high[i]:g} {unit}"
                 + self._limits.about_room(int(axis[i])),
             )
 

@@ -522,7 +522,7 @@ class DriveBank(Bank):
             approach = self._approach_of(axis, command)
             try:
                 if not low <= target <= high:
-                    raise InfeasibleError(f"position {target:g} is outside the soft limits; {low:g} to {high:g}")
+                    raise InfeasibleError(f"position {target:g} is outside the soft limits; want {low:g} to {high:g}")
                 if approach is not None:
                     approach.begin_of_take_up(target, low, high)
             except InfeasibleError as error:

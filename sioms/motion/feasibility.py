@@ -119,7 +119,7 @@ class Feasibility:
             i = int(bad.argmax())
             raise self._refusal(commands, int(order[i]), (
                 f"position {c['position'][i]:g} from here leads to {end[i, 0]:g}, outside the soft limits; "
-                f"{low[i]:g} to {high[i]:g}"
+                f"want {low[i]:g} to {high[i]:g}"
             ))  # fmt: skip
         bad = np.abs(end[:, 1]) > velocity
         if bad.any():
@@ -127,7 +127,7 @@ class Feasibility:
             raise self._refusal(
                 commands,
                 int(order[i]),
-                f"velocity {end[i, 1]:g} is above the max_velocity in force; {velocity[i]:g}",
+                f"velocity {end[i, 1]:g} is above the max_velocity in force; want at most {velocity[i]:g}",
             )
 
     def _doubtful(self, c: NDArray[Any], begin: Floats, end: Floats, bounds: Floats) -> NDArray[np.bool_]:

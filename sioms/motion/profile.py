@@ -97,7 +97,7 @@ class Planner:
         target = command.position + (state[0] if command.control_mode & modes.RELATIVE else 0.0)
         if not bounds.minimum <= target <= bounds.maximum:
             raise InfeasibleError(
-                f"position {target:g} is outside the soft limits; {bounds.minimum:g} to {bounds.maximum:g}"
+                f"position {target:g} is outside the soft limits; want {bounds.minimum:g} to {bounds.maximum:g}"
             )
         return target
 
@@ -161,7 +161,7 @@ class Planner:
             if duration > exact_s + TIME_TOLERANCE_S:
                 shortest = self._trajectory.independent_min_durations[0]
                 raise InfeasibleError(
-                    f"time {exact_s:g} s is too short for {state[0]:g} to {final[0]:g}; at least {shortest:g} s"
+                    f"time {exact_s:g} s is too short for {state[0]:g} to {final[0]:g}; want at least {shortest:g} s"
                 )
             if duration < exact_s:
                 segments.append((exact_s - duration, final[0], final[1], 0.5 * final[2], 0.0, 0.0, 0.0))

@@ -361,13 +361,13 @@ class CommandQueue:
         for axis, value, free in zip(axes.tolist(), positions.tolist(), idle.tolist(), strict=True):
             what = f"calibrate axis {axis} ({self.settings[axis].name}): "
             if not np.isfinite(value):
-                raise CommandError(errno.EINVAL, what + f"position is {value}; a finite number")
+                raise CommandError(errno.EINVAL, what + f"position is {value}; want a finite number")
             if not free:
                 raise CommandError(errno.EBUSY, what + "it moves or has commands; wait until it is idle")
             low, high = self.limits.minimum[axis], self.limits.maximum[axis]
             if not low <= value <= high:
                 raise CommandError(
-                    errno.ERANGE, what + f"position {value:g} is outside the soft limits; {low:g} to {high:g}"
+                    errno.ERANGE, what + f"position {value:g} is outside the soft limits; want {low:g} to {high:g}"
                 )
 
     def check_homing(self, axes: NDArray[np.int64], idle: NDArray[np.bool_]) -> None:
@@ -401,7 +401,7 @@ class CommandQueue:
             array = self._limit_array(name)
             values = list(given) if isinstance(given, Sequence) else [given] * len(axes)
             if len(values) != len(axes):
-                raise CommandError(errno.EINVAL, f"set limits: {len(values)} values of {name}; {len(axes)} or one")
+                raise CommandError(errno.EINVAL, f"set limits: {len(values)} values of {name}; want {len(axes)} or one")
             for axis, value in zip(axes.tolist(), values, strict=True):
                 changes.append((array, axis, self._checked_limit(axis, name, value, position)))
         for array, axis, value in changes:
@@ -425,7 +425,7 @@ class CommandQueue:
             "force_max": self.limits.force,
         }
         if name not in arrays:
-            raise CommandError(errno.EINVAL, f"set limits: no limit {name!r}; one of {', '.join(arrays)}")
+            raise CommandError(errno.EINVAL, f"set limits: no limit {name!r}; want one of {', '.join(arrays)}")
         return arrays[name]
 
     def _checked_limit(self, axis: int, name: str, value: float | None, position: NDArray[np.float64]) -> float:
@@ -435,9 +435,10 @@ class CommandQueue:
         widest = (-np.inf if lower else np.inf) if configured is None else float(configured)
         wanted = widest if value is None else float(value)
         if np.isnan(wanted) or (not name.startswith("position") and wanted <= 0):
-            raise CommandError(errno.EINVAL, what + f"{name} {wanted:g}; a positive number")
+            raise CommandError(errno.EINVAL, what + f"{name} {wanted:g}; want a positive number")
         if wanted < widest if lower else wanted > widest:
-            raise CommandError(errno.ERANGE, what + f"{name} {wanted:g} is wider than configured; {widest:g}")
+            most = f"{'at least' if lower else 'at most'} {widest:g}"
+            raise CommandError(errno.ERANGE, what + f"{name} {wanted:g} is wider than configured; want {most}")
         if (lower and position[axis] < wanted) or (name == "position_max" and position[axis] > wanted):
             raise CommandError(
                 errno.ERANGE,

@@ -326,7 +326,7 @@ def _limits(argument: Any, what: str) -> dict[str, Any]:
         raise _refuse(errno.EINVAL, f"{what}: want limits by name, e.g. {{position_max: 0.2}}")
     for name, given in argument.items():
         if name not in LIMIT_NAMES:
-            raise _refuse(errno.EINVAL, f"{what}: no limit {shown(name)}; one of {', '.join(LIMIT_NAMES)}")
+            raise _refuse(errno.EINVAL, f"{what}: no limit {shown(name)}; want one of {', '.join(LIMIT_NAMES)}")
         for value in given if isinstance(given, list) else [given]:
             if value is not None and (type(value) not in (int, float) or value != value):
                 raise _refuse(errno.EINVAL, f"{what}: {name} {shown(value)}; want a number, or none")

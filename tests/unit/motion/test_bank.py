@@ -420,7 +420,7 @@ def test_an_emptied_buffer_says_nothing_about_where_the_next_command_begins():
 def test_a_move_that_lasts_longer_than_can_be_planned_is_refused():
     rig = Rig([axis()])
     for mode in (MODE.POSITION, MODE.POSITION | MODE.VELOCITY):
-        with pytest.raises(CommandError, match="8000 s; more than 0 and at most 7600 s") as refused:
+        with pytest.raises(CommandError, match="8000 s; want more than 0 and at most 7600 s") as refused:
             rig.write(mode=mode | MODE.SPECIFIED_TIME, position=0.4, time=8000.0)
         assert refused.value.errno == errno.EINVAL
     rig.write(mode=MODE.POSITION | MODE.SPECIFIED_TIME, position=0.4, time=7599.0)

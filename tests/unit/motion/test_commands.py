@@ -7,6 +7,7 @@ import pytest
 from motion_rig import MODE, Rig, axis, records
 
 from sioms.motion import AxisKind, CommandError, EventKind
+from sioms.motion.commands import QUANTITIES, RULES
 
 NAN = float("nan")
 
@@ -127,3 +128,32 @@ def test_not_before_the_first_measurement():
     with pytest.raises(CommandError) as caught:
         bank.append(records(mode=MODE.POSITION, position=0.1), [0], 1)
     assert caught.value.errno == errno.EIO
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.field)
+def test_a_refusal_says_what_is_wanted(rule):
+    """Of every column of the table, for what is no number and for what is too much."""
+    rig = Rig([axis()])
+    mode = rule.flag if rule.flag & QUANTITIES else rule.flag | MODE.POSITION
+    for value in (np.nan, np.inf, *([1e9, -1e9] if rule.bound or rule.field in ("time", "kp") else [])):
+        given = {"k": 1.0, "time": 1.0, "max_velocity": 1.0, "max_acceleration": 1.0, rule.field: value}
+        if rule.field == "time" and value == -1e9:
+            continue  # until the next command
+        with pytest.raises(CommandError, match="; want "):
+            rig.write(mode=mode, **given)
+
+
+@pytest.mark.parametrize("position", [np.nan, np.inf, 1e9])
+def test_a_refusal_of_a_place_says_what_is_wanted(position):
+    rig = Rig([axis()])
+    for ask in (
+        lambda: rig.write(mode=MODE.POSITION, position=position),
+        lambda: rig.write(mode=MODE.POSITION | MODE.RELATIVE, position=position),
+        lambda: rig.bank.calibrate([0], [position]),
+        lambda: rig.bank.set_limits([0], position_max=np.nan),
+        lambda: rig.bank.set_limits([0], velocity_max=1e9),
+        lambda: rig.bank.set_limits([0], speed=1.0),
+        lambda: rig.bank.append(records(mode=MODE.POSITION, axis=7), [0], rig.now_ns),
+    ):
+        with pytest.raises(CommandError, match="; want "):
+            ask()
