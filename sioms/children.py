@@ -1,8 +1,10 @@
 """Processes that end with the program that starts them, however that ends.
 
 A program that is told to end (SIGTERM, SIGHUP, Ctrl-C) ends what it has started by itself; for one that is killed the
-kernel
-does so: each child asks it for a SIGTERM on the death of its parent. A daemon that gets it stops its drivers.
+kernel does so: each child asks it for a SIGKILL on the death of its parent. A SIGTERM would not do: a process that is
+stopped (SIGSTOP) does not take it, nor one that is stuck. The drivers of a daemon that is killed stop and end.
+
+The kernel counts the end of the thread that has started a child as its parent's death.
 """
 
 from __future__ import annotations
@@ -29,14 +31,18 @@ _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)
 
 
-def ends_with_us() -> Callable[[], None]:
-    """Return the ``preexec_fn`` of a child that gets SIGTERM when the thread that starts it ends, by prctl(2)."""
+def ends_with_us(how: signal.Signals = signal.SIGKILL) -> Callable[[], None]:
+    """Return the ``preexec_fn`` of a child that gets a signal when the thread that starts it ends, by prctl(2).
+
+    Args:
+        how: the signal; another than SIGKILL is for programs of others, which may have something to put in order.
+    """
     parent = os.getpid()
 
     def tie() -> None:
-        _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM, 0, 0, 0)
+        _libc.prctl(_PR_SET_PDEATHSIG, how, 0, 0, 0)
         if os.getppid() != parent:  # it has died meanwhile
-            os._exit(128 + signal.SIGTERM)
+            os._exit(128 + how)
 
     return tie
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import collections
 import contextlib
-import ctypes
 import fcntl
 import gc
 import itertools
@@ -21,10 +20,12 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+from sioms.children import ends_with_us
 
 # A loaded machine is no fault of the code under test: examples are counted, not timed. They are the same each
 # time; --hypothesis-profile=search looks for new ones.
@@ -156,13 +157,17 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     Path(target).write_text(json.dumps(known, indent=0, sort_keys=True) + "\n")
 
 
-_libc = ctypes.CDLL(None)
-_PR_SET_PDEATHSIG = 1
+_popen = subprocess.Popen.__init__
 
 
-def _end_with_us() -> None:
-    """In the new process: get SIGTERM when the test run dies, however it dies (prctl(2))."""
-    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+def _popen_tied(self: subprocess.Popen[Any], *arguments: Any, **options: Any) -> None:
+    """Start a process that ends with the test run, however that ends; from another thread it would end with that."""
+    if options.get("preexec_fn") is None and threading.current_thread() is threading.main_thread():
+        options["preexec_fn"] = ends_with_us()
+    _popen(self, *arguments, **options)
+
+
+subprocess.Popen.__init__ = _popen_tied  # type: ignore[method-assign]
 
 
 class Running:
@@ -186,7 +191,7 @@ class Running:
             stderr=subprocess.STDOUT,
             text=True,
             start_new_session=True,
-            preexec_fn=_end_with_us,
+            preexec_fn=ends_with_us(),
         )
         self.lines: list[str] = []
         self._news = threading.Condition()

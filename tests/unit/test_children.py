@@ -35,10 +35,16 @@ finally:
 """
 
 
-def test_a_child_ends_with_a_parent_that_is_killed() -> None:
-    with subprocess.Popen([sys.executable, "-c", PARENT], stdout=subprocess.PIPE, text=True) as parent:
+@pytest.mark.parametrize("state", ["runs", "is stopped", "does not listen"])
+def test_a_child_ends_with_a_parent_that_is_killed(state: str) -> None:
+    ignores = "import signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); " if state == "does not listen" else ""
+    program = PARENT.replace('"import time', f'"{ignores}import time')
+    with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as parent:
         assert parent.stdout is not None
-        child = os.pidfd_open(int(parent.stdout.readline()))
+        pid = int(parent.stdout.readline())
+        child = os.pidfd_open(pid)
+        if state == "is stopped":
+            os.kill(pid, signal.SIGSTOP)
         parent.kill()
         parent.wait()
         assert is_readable(child, 30.0), "the child lives on"
@@ -56,6 +62,33 @@ def test_a_command_that_is_told_to_end_puts_things_in_order(number: signal.Signa
         assert command.stdout is not None and command.stdout.readline() == "ready\n"
         command.send_signal(number)
         assert (command.stdout.read(), command.wait(30.0)) == ("in order\n", 128 + number)
+
+
+SIMULATED = """
+import sys, time
+from sioms.check.station import Peer
+device = Peer(sys.argv[1:], "a simulated device")
+print(device.pid, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_simulated_device_ends_with_a_check_that_is_killed(stopped: bool) -> None:
+    """A check stops the processes of some trials; one that is stopped takes no SIGTERM and sees no end of file."""
+    device = [sys.executable, "-P", "-m", "sioms.drivers.modbus.simulated.leadshine"]
+    with subprocess.Popen(
+        [sys.executable, "-P", "-c", SIMULATED, *device], stdout=subprocess.PIPE, text=True
+    ) as parent:
+        assert parent.stdout is not None
+        pid = int(parent.stdout.readline())
+        child = os.pidfd_open(pid)
+        if stopped:
+            os.kill(pid, signal.SIGSTOP)
+        parent.kill()
+        parent.wait()
+        assert is_readable(child, 30.0), "the device lives on"
+    os.close(child)
 
 
 def test_everything_that_a_tool_starts_ends_with_it() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -45,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
         child: subprocess.Popen[bytes] | None = None
         if args.words:
             environment = {**os.environ, "SIOMS_SOCKET": replay.path}
-            child = subprocess.Popen(args.words, env=environment, preexec_fn=ends_with_us())
+            child = subprocess.Popen(args.words, env=environment, preexec_fn=ends_with_us(signal.SIGTERM))
         else:
             print(f"SIOMS_SOCKET={replay.path}", flush=True)
 
