@@ -122,6 +122,28 @@ def test_markers_pass_from_cell_to_cell(fleet: sioms.Fleet) -> None:
     other.free()
 
 
+def _first_motions(nodes: list[Any], begin: list[float]) -> list[int | None]:
+    """Return the times of the first snapshots that show motion; None where that before it is not known.
+
+    A page keeps a quarter of a second, and that of a slow link has gaps: the oldest there need not be the first.
+    """
+    seen: list[list[Any]] = [[node.read()] for node in nodes]
+
+    def all_have_moved() -> bool:
+        for node, known in zip(nodes, seen, strict=True):
+            known += node.history(known[-1].number)
+        return all(abs(known[-1].position[0] - start) > 0.009 for known, start in zip(seen, begin, strict=True))
+
+    wait_for(all_have_moved, "all to move")
+    firsts: list[int | None] = []
+    for known, start in zip(seen, begin, strict=True):
+        moved = [abs(each.commanded_position[0] - start) > 1e-6 for each in known]
+        first = moved.index(True)
+        is_known = first and known[first - 1].number + 1 == known[first].number
+        firsts.append(known[first].stamp_ns if is_known else None)
+    return firsts
+
+
 def test_cells_start_at_one_instant_or_not_at_all(fleet: sioms.Fleet) -> None:
     nodes = [fleet.open(f"{name}:mod0", "rw", lease=5.0) for name in fleet]
     try:
@@ -133,15 +155,20 @@ def test_cells_start_at_one_instant_or_not_at_all(fleet: sioms.Fleet) -> None:
         assert not any(node.read().in_motion[0] for node in nodes)
         at_ns = fleet.synch(*nodes, lead=0.3, within=0.1)
         assert at_ns > time.monotonic_ns()
-        numbers = [node.read().number for node in nodes]
-        wait_for(
-            lambda: all(abs(n.read().position[0] - s) > 0.009 for n, s in zip(nodes, begin, strict=True)), "all to move"
-        )
-        firsts = []
-        for node, number, start in zip(nodes, numbers, begin, strict=True):
-            moved = [s for s in node.history(number) if abs(s.commanded_position[0] - start) > 1e-6]
-            firsts.append(moved[0].stamp_ns)
-        assert max(firsts) - min(firsts) < 30_000_000, "the same tick, as far as two machines' clocks are known"
+        firsts = _first_motions(nodes, begin)
+        for _ in range(5):
+            if None not in firsts:
+                break
+            for node in nodes:
+                node.wait_until_idle()
+            begin = [node.read().position[0] for node in nodes]
+            for node, start in zip(nodes, begin, strict=True):
+                node.command(position=start + 0.01, synch=True)
+            fleet.synch(*nodes, lead=0.3, within=0.1)
+            firsts = _first_motions(nodes, begin)
+        known = [first for first in firsts if first is not None]
+        assert len(known) == len(nodes), "which snapshots showed it first"
+        assert max(known) - min(known) < 30_000_000, "the same tick, as far as two machines' clocks are known"
     finally:
         for node in nodes:
             node.close()
