@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -32,6 +33,7 @@ CERTAIN = 4.5
 its rows under several loads have their errors in common."""
 POSSIBLE = 0.5  # times its natural size that an effect may have before it is said that it is not excluded
 UNTOLD = 1e-6  # times its noise by which a row must change to tell of an effect
+ALIKE = 0.7  # cosine of what two effects change, from which on they are tried together
 SLIGHT = 1.0  # times the stated noise of one row by which an effect must change at least one
 
 
@@ -133,6 +135,60 @@ def overlooked(
     best = max(shown.values(), key=lambda m: _worse(data, m, good.model), default=good.model)
     shown = {told: m for told, m in shown.items() if _worse(data, best, m) < CERTAIN}
     notes = v.notes + (f"not excluded by these rows: {'; '.join(wide)}",) * bool(wide)
+    if not shown:
+        return replace(v, notes=notes)
+    return replace(
+        v, outcome=Outcome.AMBIGUOUS, alternatives=(*v.alternatives, *(tuple(m.effects) for m in shown.values())),
+        experiments=v.experiments or propose([v.model, *shown.values()]),
+        notes=(*notes, f"these rows show, too few to name it: {' or '.join(shown)}"),
+    )  # fmt: skip
+
+
+def cancelling(
+    v: SensorVerdict,
+    data: HandData,
+    scatter: Sequence[float],
+    propose: Callable[[Sequence[SensorModel]], tuple[Proposal, ...]],
+) -> SensorVerdict:
+    """List pairs of effects that undo each other in these rows: each alone is excluded, both together are not.
+
+    One finger turned by a degree and the other by a degree the other way leave next to nothing in a dozen grasps of
+    disks, in whose rows either of them alone would show.
+
+    Args:
+        v: the verdict; data: all rows; scatter: by how many times its stated noise each view is taken to scatter.
+        propose: what decides between models.
+    """
+    if v.outcome is Outcome.UNEXPLAINED:
+        return v
+    good, weights = _by_scatter(data, v.model)
+    columns = dict[str, Floats]()
+    for name, effect in v.model.library.items():
+        if effect.rankable and not name.startswith(TERM_PREFIX) and name not in v.model.effects:
+            column = weights * screening_columns(data, good.model, effect)[:, 0]
+            if np.any(np.abs(column) > UNTOLD):
+                columns[name] = column / np.linalg.norm(column)
+    shown, wide = dict[str, SensorModel](), list[str]()
+    for one, other in combinations(columns, 2):
+        if abs(columns[one] @ columns[other]) < ALIKE:
+            continue
+        start = good.model.with_effect(one, good.model.plain(one))
+        both = refit(data, start.with_effect(other, start.plain(other)), weights, (), PATIENCE)
+        halves, told, sure, large = half_intervals(data, both, weights), [], True, True
+        for name in (one, other):
+            effect = v.model.library[name]
+            q = effect.primary
+            at = next(i for i, f in enumerate(both.free) if (f.effect, f.symbol) == (name, q.symbol))
+            half, value = float(halves[at]), float(both.model.effects[name][q.symbol][0])
+            told.append(f"{effect.title}, {q.symbol} {value - half:.3g} to {value + half:.3g}")
+            sure &= abs(value - effect.neutral) > half and physical(both.model, name)
+            sure &= not slight(data, scatter, both.model, name)
+            large &= abs(value - effect.neutral) + half > POSSIBLE * q.size
+        if sure and _worse(data, both.model, good.model) > CERTAIN:
+            shown[" with ".join(told)] = both.model
+        elif large and not all(any(f"{v.model.library[n].title}," in note for note in v.notes) for n in (one, other)):
+            wide.append(" with ".join(told))
+    notes = v.notes + (f"not excluded by these rows, both at once: {'; '.join(wide)}",) * bool(wide)
     if not shown:
         return replace(v, notes=notes)
     return replace(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.hand.belief import settles
-from sioms.reconcile.hand.doubts import doubted, overlooked, slight, unsure
+from sioms.reconcile.hand.doubts import cancelling, doubted, overlooked, slight, unsure
 from sioms.reconcile.hand.grasps import Floats, Grasps
 from sioms.reconcile.hand.model_file import Noise
 from sioms.reconcile.hand.plan import propose
@@ -225,7 +225,8 @@ def reconcile(
         )  # fmt: skip
         verdict = analyse(subject, options)
     said = unsure(doubted(verdict, subject.whole, subject.propose), subject.whole, subject.propose)
-    return overlooked(said, subject.whole, subject.scatter, subject.propose)
+    said = overlooked(said, subject.whole, subject.scatter, subject.propose)
+    return cancelling(said, subject.whole, subject.scatter, subject.propose)
 
 
 def slight_ones(subject: HandSubject, v: SensorVerdict) -> dict[str, str]:

@@ -17,7 +17,7 @@ from sioms.hand.kinematics import Hand
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.hand import COLUMNS, grasps_of, read_grasps, read_model
 from sioms.reconcile.hand.belief import HandBelief, friction, gaps, touched
-from sioms.reconcile.hand.doubts import alternatives, overlooked, unsure
+from sioms.reconcile.hand.doubts import alternatives, cancelling, overlooked, unsure
 from sioms.reconcile.hand.effects import library
 from sioms.reconcile.hand.grasps import DISK, Grasps
 from sioms.reconcile.hand.model_file import Noise, from_table, to_toml
@@ -245,6 +245,32 @@ def test_what_rows_do_not_exclude_is_said() -> None:
         v = overlooked(Said(model, (), Outcome.NONE), subject.whole, subject.scatter, lambda models: ())  # type: ignore[arg-type]
         assert v.outcome is Outcome.NONE
         assert any(n.startswith("not excluded") and "mounting angle of finger 1" in n for n in v.notes) is wide
+
+
+def test_two_that_undo_each_other_are_not_told_as_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A dozen grasps of two disks: one finger turned by a degree, the other by a degree the other way, leave next to
+    nothing; either alone would show. In full records nothing of the kind is left open.
+    """
+    hidden = HiddenHand("h", "multi", wrist=True, named={
+        "mounting_angle_1": {"beta": 1.0 * DEG}, "mounting_angle_2": {"beta": -1.0 * DEG},
+    })  # fmt: skip
+    model, noise = from_table(tomllib.loads(hidden.public()), "x")
+
+    def disks(self: Any, grasp: int) -> Any:
+        draw = self.rng.uniform
+        return 1, grasp % 2, (0.011, 0.030)[grasp % 2], float(draw(-1.0, 1.0)), draw(-0.1, 0.1, 2), draw(1.0, 2.1, 2)
+
+    full = of(HiddenHand("n", "null", wrist=True))
+    monkeypatch.setattr(hand_world._Session, "setting", disks)
+    for rows, open_ in ((few(of(hidden, 5811)), True), (full, False)):
+        subject = prepare(rows, model, noise)
+        before: Any = Said(model, (), Outcome.NONE)
+        alone = overlooked(before, subject.whole, subject.scatter, lambda models: ())
+        assert not any("mounting" in note for note in alone.notes) and alone.outcome is Outcome.NONE
+        v = cancelling(before, subject.whole, subject.scatter, lambda models: ())
+        found = [n for n in v.notes if "finger 1, beta" in n and "with mounting angle of finger 2, beta" in n]
+        assert bool(found) is open_, v.notes
+        assert open_ or v.outcome is Outcome.NONE
 
 
 def test_effects_within_the_noise_of_one_reading_are_not_named() -> None:
