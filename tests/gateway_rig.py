@@ -21,7 +21,7 @@ from sioms.protocol.records import READ_SIZE
 
 KATE, BEN = Principal("kate", ("ops",)), Principal("ben")
 MS = 1_000_000
-HEARD = verbs.Heard(0).packed()[:2]
+HEARD, PASSED = verbs.Heard(0).packed()[:2], verbs.Passed(0, b"").packed()[:2]
 WRITE = verbs.Write(0, 0.0, b"").packed(3)
 
 
@@ -162,9 +162,13 @@ class World:
 
 def said(node: Node) -> list[bytes]:
     """Return what a driver has got of its client, without what the gateway says of it."""
-    return [packet for packet in node.got if not packet.startswith(HEARD)]
+    return [
+        decode(packet)[3] if packet.startswith(PASSED) else packet
+        for packet in node.got
+        if not packet.startswith(HEARD)
+    ]
 
 
 def heard(node: Node) -> list[int]:
     """Return when the client said what its driver has got, as the gateway tells."""
-    return [decode(packet)[2] for packet in node.got if packet.startswith(HEARD)]
+    return [decode(packet)[2] for packet in node.got if packet.startswith((HEARD, PASSED))]

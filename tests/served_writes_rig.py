@@ -95,6 +95,9 @@ def packets(chance: random.Random) -> Iterator[tuple[bytes, bool]]:
         packet = encode(chance.choice([*[1] * 12, 2, 4]), number, flags, seconds, data)
         if chance.random() < 0.1:
             packet = encode(chance.choice([7, 7, 7, 3]), chance.choice([0, 0, 1]), chance.choice([0, 1, number, -1]))
+        if chance.random() < 0.2:
+            at_ns = chance.choice([1, 127, 128, number, 2**40, 2**62, 0, -1])
+            packet = encode(chance.choice([8, 8, 8, 8, 7]), chance.choice([0, 0, 0, 0, 1]), at_ns, packet)
         usual = seconds != float("inf") and (type(seconds) is not int or 0 <= seconds < 128)
         match chance.randrange(12):
             case 0:
@@ -135,9 +138,9 @@ class Served:
             first=row(1, count=MOST_WRITERS), known=row(len(AXES), count=MOST_WRITERS), axes=row(1, *AXES, count=4),
             heard=row(count=MOST_WRITERS),
             request=StopFile(there=1, file=request, word=0, changed=changed_ns(request)), gives_way=0,
-            packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, size=row(), writer=row(), came=row(),
-            effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0, grace_ns=0,
-            patience_ns=0,
+            packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, start=row(), size=row(), writer=row(),
+            came=row(), effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0,
+            grace_ns=0, patience_ns=0,
             reply=np.zeros(REPLY, dtype=np.uint8),
         )  # fmt: skip
 

@@ -17,7 +17,16 @@ from sioms.protocol import link, verbs
 from sioms.protocol.clock import Wall
 from sioms.protocol.journal import JOURNAL_SIZE, pack_events
 from sioms.protocol.link import Down, MalformedFrame, Up, Update
-from sioms.protocol.messages import ClientVerb, MalformedMessage, decode, decode_reply, refusal, reply, value_of
+from sioms.protocol.messages import (
+    MAX_INLINE,
+    ClientVerb,
+    MalformedMessage,
+    decode,
+    decode_reply,
+    refusal,
+    reply,
+    value_of,
+)
 from sioms.protocol.page import as_of_ns
 
 from .parts import Followed, Held, Outside, Principal, Session
@@ -26,6 +35,8 @@ KEEPALIVE = verbs.Keepalive().packed()
 READ = (verbs.Represent, verbs.Said, verbs.Supervise, verbs.Reset, verbs.Journal, verbs.Cancel, verbs.Open)
 """Requests to the daemon of which the gateway reads more than that they are not these."""
 PASSED_ON = frozenset(map(int, ClientVerb)) - {int(each.verb) for each in READ}
+GATEWAYS = (verbs.Heard.verb, verbs.Passed.verb)
+"""What no client may say to a driver."""
 SHORT_NUMBERS = frozenset((*range(0x80), 0xCC, 0xCD, 0xCE))
 """First bytes of message numbers below 2**32."""
 UNUSUAL = (b"\xdc", b"\xdd")
@@ -204,11 +215,14 @@ class Gateway:
             held.until_ns = max(held.until_ns, stamp_ns + held.lease_ns)
         try:
             is_silent = packet == KEEPALIVE  # how old what acts is, the driver has to know exactly
+            if _verb(packet) in GATEWAYS:
+                raise MalformedMessage("how old a word is, is the gateway's to say")
             if stamp_ns - held.told_ns > (held.lease_ns // TOLD if is_silent else 0):
                 held.told_ns = stamp_ns
+                if not is_silent and len(packet) <= MAX_INLINE:
+                    held.node.send(verbs.Passed(stamp_ns, packet).packed())
+                    return
                 held.node.send(verbs.Heard(stamp_ns).packed())
-            if _verb(packet) == verbs.Heard.verb:
-                raise MalformedMessage("how old a word is, is the gateway's to say")
             if not is_silent:
                 held.node.send(packet)
         except OSError:

@@ -104,6 +104,7 @@ class HandleVerb(IntEnum):
     CANCEL = 5
     PART = 6
     HEARD = 7
+    PASSED = 8
 
 
 class MalformedMessage(Exception):

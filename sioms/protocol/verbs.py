@@ -421,6 +421,15 @@ class Heard(Message, on=ON_HANDLE, verb=HandleVerb.HEARD, notice=True, query=Tru
     at_ns: Integer
 
 
+class Passed(Message, on=ON_HANDLE, verb=HandleVerb.PASSED, notice=True, query=True):
+    """A packet of a client, as this socket takes it, which said it at this instant at the earliest
+    [ns, CLOCK_MONOTONIC]: as Heard, and then that packet.
+    """
+
+    at_ns: Integer
+    packet: Records
+
+
 class CancelOnHandle(Message, on=ON_HANDLE, verb=HandleVerb.CANCEL, query=True):
     """Cancel a waiting request of this handle. Answer: whether there was one."""
 

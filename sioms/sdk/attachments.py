@@ -169,19 +169,31 @@ class Attachments:
             return
         except OSError:
             packet, timestamp_ns = b"", 0
-        latest_ns = handle.heard_ns if handle.passed_on else NEVER_NS
-        came = Came(UNKNOWN if handle.is_in_doubt else resets, timestamp_ns, latest_ns)
-        handle.took(len(packet))
         handle.hear(time.monotonic_ns())
 
         def serve() -> None:
             if not packet:
                 self.drop(handle)
                 return
-            number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
-            self._serve(handle, number, message, packet, came)
+            number, message, whole = self._taken(handle, packet)
+            latest_ns = handle.heard_ns if handle.passed_on else NEVER_NS
+            came = Came(UNKNOWN if handle.is_in_doubt else resets, timestamp_ns, latest_ns)
+            handle.took(len(packet))
+            self._serve(handle, number, message, whole, came)
 
         self._guarded(handle, serve)
+
+    def _taken(self, handle: Handle, packet: bytes) -> tuple[int, Message, bytes]:
+        """Take a packet, and what a gateway says of it; return its number, message, and the packet of the client."""
+        number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
+        if not isinstance(message, verbs.Passed):
+            return number, message, packet
+        self.heard(handle, min(message.at_ns, handle.came_ns))
+        packet = message.packet
+        number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
+        if isinstance(message, verbs.Passed):
+            raise MalformedMessage("a packet that is passed on twice")
+        return number, message, packet
 
     def _guarded(self, handle: Handle, serve: Callable[[], None]) -> None:
         """Serve a client; what goes wrong ends its handle."""

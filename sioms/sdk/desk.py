@@ -65,7 +65,7 @@ class WriteDesk:
             axes=row(axes[0].n), heard=row(MOST_WRITERS), request=self.request, gives_way=int(gives_way),
             grace_ns=GRACE_NS if period_ns <= SOON_NS else 0,
             patience_ns=PATIENCE_NS if period_ns <= SOON_NS else 0,
-            packets=self._packets, kept=0, size=row(MOST_KEPT), writer=row(MOST_KEPT),
+            packets=self._packets, kept=0, start=row(MOST_KEPT), size=row(MOST_KEPT), writer=row(MOST_KEPT),
             came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
             replace=0, at=0, records=0, reply=np.zeros(REPLY, dtype=np.uint8),
         )  # fmt: skip
@@ -108,7 +108,7 @@ class WriteDesk:
                 self._clients.heard(self._writers[i], heard_ns)
         kept, record.kept = record.kept, 0
         for i in range(kept):
-            packet = bytes(self._packets[i * ROOM : i * ROOM + record.size[i]])
+            packet = bytes(self._packets[record.start[i] : record.start[i] + record.size[i]])
             self._clients.served(
                 self._writers[record.writer[i]], packet, int(record.came[i]), int(record.effect[i]),
                 int(record.took[i]), None if record.sent[i] else tick,

@@ -34,6 +34,7 @@ REPLY: Final = 40
 REPLACE: Final = int(WriteFlag.REPLACE)
 WRITE: Final = int(HandleVerb.WRITE)
 HEARD: Final = int(HandleVerb.HEARD)
+PASSED: Final = int(HandleVerb.PASSED)
 
 # MessagePack.
 FIX: Final = 0x80
@@ -45,6 +46,7 @@ DOUBLE: Final = 0xCB
 UINT_8: Final = 0xCC
 UINT_64: Final = 0xCF
 NOTICE: Final = 0x93
+LONG_NOTICE: Final = 0x94
 PARTS: Final = 0x95
 ANSWER: Final = 0x96
 INFINITE: Final = 0x7FF
@@ -71,9 +73,10 @@ class Desk(Record):
     A tick that comes less than ``grace_ns`` behind the first packet that is kept may come before it; one that comes
     less than ``patience_ns`` behind it, while a client has yet to read an answer.
 
-    ``kept`` packets lie in ``packets``, each in ROOM bytes, with its ``size``, its ``writer``, when it ``came`` and
-    took ``effect``, how long serving it ``took`` [ns], and whether its answer could be ``sent``; they hold
-    ``waiting`` commands. ``at`` and ``records`` are the place in, and the bytes of, the packet that is looked at.
+    ``kept`` packets lie in ``packets``, each in ROOM bytes, from ``start`` on, where a gateway has put something ahead,
+    with its ``size``, its ``writer``, when it ``came`` and took ``effect``, how long serving it ``took`` [ns], and
+    whether its answer could be ``sent``; they hold ``waiting`` commands. ``at`` and ``records`` are the place in, and
+    the bytes of, the packet that is looked at.
     """
 
     plain: Plain
@@ -89,6 +92,7 @@ class Desk(Record):
     patience_ns: int
     packets: Bytes
     kept: int
+    start: Integers
     size: Integers
     writer: Integers
     came: Integers
@@ -150,6 +154,22 @@ def pass_seconds(d: Desk, end: int) -> int:
 
 
 @step
+def read_bytes(d: Desk, end: int) -> int:
+    """Read the head of bytes at ``at`` that end at ``end``, which moves behind it; return 0 when it is none."""
+    if d.at + 3 > end:
+        return 0
+    kind = d.packets[d.at]
+    size = d.packets[d.at + 1]
+    d.at += 2
+    if kind == BYTES_16:
+        size = (size << 8) | d.packets[d.at]
+        d.at += 1
+    elif kind != BYTES_8:
+        return 0
+    return size == end - d.at
+
+
+@step
 def read_write(d: Desk, end: int) -> int:
     """Read a packet at ``at``, up to ``end``, as a write; return 0 when it is something else, or written otherwise."""
     if end - d.at < 8 or d.packets[d.at] != PARTS or d.packets[d.at + 1] != WRITE:
@@ -160,17 +180,10 @@ def read_write(d: Desk, end: int) -> int:
         return 0
     d.replace = d.packets[d.at] & REPLACE
     d.at += 1
-    if not pass_seconds(d, end) or d.at + 3 > end:
+    if not pass_seconds(d, end) or not read_bytes(d, end):
         return 0
-    kind = d.packets[d.at]
-    d.records = d.packets[d.at + 1]
-    d.at += 2
-    if kind == BYTES_16:
-        d.records = (d.records << 8) | d.packets[d.at]
-        d.at += 1
-    elif kind != BYTES_8:
-        return 0
-    return d.records == end - d.at
+    d.records = end - d.at
+    return 1
 
 
 @step
@@ -181,6 +194,18 @@ def read_heard(d: Desk, end: int) -> int:
     d.at += 3
     at_ns = take_number(d, end)
     return at_ns if at_ns > 0 and d.at == end else 0
+
+
+@step
+def read_passed(d: Desk, end: int) -> int:
+    """Read a packet at ``at``, up to ``end``, as a Passed, whose own packet is at ``at`` then; return the instant that
+    it tells, 0: it is something else.
+    """
+    if end - d.at < 4 or d.packets[d.at] != LONG_NOTICE or d.packets[d.at + 1] != PASSED or d.packets[d.at + 2]:
+        return 0
+    d.at += 3
+    at_ns = take_number(d, end)
+    return at_ns if at_ns > 0 and read_bytes(d, end) else 0
 
 
 @step
@@ -266,6 +291,10 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
         d.heard[who] = max(d.heard[who], min(heard_ns, came_ns))
         return 0
     d.at = begin
+    heard_ns = read_passed(d, begin + size)
+    if not heard_ns:
+        d.at = begin
+    start = d.at
     if not read_write(d, begin + size):
         return 1
     count = counted(d)
@@ -275,7 +304,9 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     kept = d.kept
     d.effect[kept] = clock_ns()
     sent = send_packet(d.fds[who], d.reply, put_reply(d, tick, d.effect[kept]))
-    d.size[kept] = size
+    d.heard[who] = max(d.heard[who], min(heard_ns, came_ns))
+    d.start[kept] = start
+    d.size[kept] = begin + size - start
     d.writer[kept] = who
     d.came[kept] = came_ns
     d.sent[kept] = sent >= 0

@@ -86,6 +86,7 @@ from sioms.protocol.verbs import (
     Message,
     Open,
     Part,
+    Passed,
     Reload,
     Report,
     Represent,
@@ -157,6 +158,7 @@ RECORDED: list[tuple[Message, str]] = [
     (Subscribe(-1), "930305ff"),
     (Keepalive(), "920405"),
     (Heard(7), "93070507"),
+    (Passed(7, b"\x92\x04\x00"), "94080507c403920400"),
     (CancelOnHandle(5), "93050505"),
     (Part(9, b"\x03"), "94060509c40103"),
     (

@@ -367,6 +367,8 @@ class Replay:
         match message:
             case verbs.Keepalive() | verbs.Heard() | verbs.Part():
                 return
+            case verbs.Passed(_, packet):
+                self._handle(peer, *verbs.take(packet, verbs.ON_HANDLE))
             case verbs.Subscribe(every):
                 peer.node.readers.pop(peer.pipe, None)
                 if every:

@@ -21,7 +21,7 @@ from sioms.gateway.parts import Principal
 from sioms.protocol import link, verbs
 from sioms.protocol.flags import Request
 from sioms.protocol.link import Down, Up
-from sioms.protocol.messages import decode, decode_reply, refusal, reply
+from sioms.protocol.messages import MAX_INLINE, decode, decode_reply, refusal, reply
 
 
 @pytest.fixture
@@ -158,7 +158,7 @@ def test_the_driver_is_told_how_old_its_clients_word_is_so_that_a_gateway_that_f
     told_ns = world.told(b"a")
     world.now_ns += 190 * MS
     world.frame(b"a", Up.PACKET, 5, WRITE, stamp_ns=told_ns)
-    assert node.got == [verbs.Heard(told_ns).packed(), WRITE], "the lease of the driver began 190 ms ago"
+    assert node.got == [verbs.Passed(told_ns, WRITE).packed()], "the lease of the driver began 190 ms ago"
     for _ in range(100):
         world.now_ns += MS
         world.gateway.tick()
@@ -178,7 +178,11 @@ def test_how_old_the_resets_of_a_client_are_is_told_to_driver_and_daemon(world: 
     reset = verbs.Ioctl(Request.RESET, None, None).packed(7)
     world.now_ns += 190 * MS
     world.frame(b"a", Up.PACKET, 5, reset, stamp_ns=told_ns)
-    assert node.got == [verbs.Heard(told_ns).packed(), reset]
+    assert node.got == [verbs.Passed(told_ns, reset).packed()]
+    long = verbs.Part(8, bytes(MAX_INLINE)).packed()
+    told_ns = world.told(b"a")
+    world.frame(b"a", Up.PACKET, 5, long, stamp_ns=told_ns + 1)
+    assert node.got[1:] == [verbs.Heard(told_ns + 1).packed(), long], "a packet has its bounds"
     for stamp_ns, said_ns in ((told_ns, told_ns), (0, 1)):
         count = len(line.got)
         world.frame(b"a", Up.PACKET, 0, verbs.Reset("mod0").packed(9), stamp_ns=stamp_ns)
@@ -186,8 +190,10 @@ def test_how_old_the_resets_of_a_client_are_is_told_to_driver_and_daemon(world: 
 
 
 @pytest.mark.parametrize(
-    "packed", [b"\x93\x07\x00", b"\x93\xcc\x07\x00", b"\xdc\x00\x03\x07\x00", b"\xdd\x00\x00\x00\x03\xcd\x00\x07\x00"]
-)
+    "packed",
+    [b"\x93\x07\x00", b"\x93\xcc\x07\x00", b"\xdc\x00\x03\x07\x00", b"\xdd\x00\x00\x00\x03\xcd\x00\x07\x00",
+     b"\x94\x08\x00", b"\x94\xcc\x08\x00"],
+)  # fmt: skip
 def test_a_client_does_not_say_how_old_its_own_word_is(world: World, packed: bytes) -> None:
     """The driver would take that of a client whose word lay in a slow link for new."""
     world.begin(b"a")

@@ -11,8 +11,9 @@ from served_writes_rig import packets
 from sioms.drivers.sim.axes import SimAxes
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.journal import JournalReader, Note
+from sioms.protocol.messages import HandleVerb
 from sioms.protocol.records import AXIS_WRITE, WRITE
-from sioms.protocol.verbs import Heard
+from sioms.protocol.verbs import Heard, Passed
 
 LIMITS = {"position_min": -1.0, "position_max": 1.0, "velocity_max": 0.5, "acceleration_max": 5.0, "force_max": 60.0}
 TABLE = {"axis": [{"name": f"a{i}", **LIMITS, "motor": {"mass": 1.0}} for i in range(4)]}
@@ -125,6 +126,13 @@ def test_steps_hand_over_what_a_gateway_says_of_its_client(make):
     client.channel.notice(Heard(said_ns - 1).packed())
     world.serve(client)
     assert handle.heard_ns == said_ns, "nor earlier than before"
+    world.tick()
+    count = world.served
+    put = client.channel._put
+    client.channel._put = lambda packet: put(Passed(said_ns + 1, packet).packed())
+    client.write(record(), replace=True)
+    assert world.served == count + 1 and handle.heard_ns == said_ns + 1, "both in one packet"
+    assert events(world)[-1][2][1] == HandleVerb.WRITE, "the journal has what the client sent"
 
 
 @pytest.mark.parametrize("why", ["a wait", "writes under way", "parts", "halted", "stopped", "admits", "link", "reads"])

@@ -17,9 +17,10 @@ from sioms.drivers.sim.axes import SimAxes
 from sioms.drivers.sim.io import SimIo
 from sioms.protocol.driver_verbs import DriverVerb
 from sioms.protocol.flags import ControlMode, NodeClass, Request
+from sioms.protocol.messages import MalformedMessage
 from sioms.protocol.records import AXIS_WRITE, WRITE, WRITE_STRUCT
 from sioms.protocol.stopjournal import StopJournal, node_entry, parts_of, replay
-from sioms.protocol.verbs import Heard, Part, Write
+from sioms.protocol.verbs import Heard, Part, Passed, Write
 
 AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "motor": {"mass": 1.0}, "force_max": 60.0}
 LATER_NS = 1_000_000
@@ -594,3 +595,23 @@ def test_what_was_under_way_on_a_network_is_of_before_and_what_knows_of_the_rese
     sock.send(Heard(CLOCK()).packed())
     owner.jog()
     assert owner.served() == [None, errno.ECANCELED, None]
+
+
+def test_so_it_is_where_a_gateway_says_it_in_the_packet_that_it_passes_on(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    channel, handle = owner.client.channel, axes.runtime.clients.handles[owner.client.node.handle]
+    said_ns, send = 0, channel._put
+    channel._put = lambda packet: send(Passed(said_ns, packet).packed())  # type: ignore[method-assign]
+    said_ns = before_ns = CLOCK()
+    owner.jog()
+    assert owner.served() == [None] and handle.heard_ns == before_ns and handle.passed_on
+    _stop_and_reset(axes, [0])
+    axes.runtime.heed()
+    axes.tick()
+    owner.jog()  # passed on by now, and as old as the last one
+    assert owner.served() == [None, errno.ECANCELED]
+    said_ns = CLOCK()
+    owner.jog()
+    assert owner.served() == [None, errno.ECANCELED, None]
+    with pytest.raises(MalformedMessage, match="twice"):
+        axes.runtime.clients._taken(handle, Passed(said_ns, Passed(said_ns, b"").packed()).packed())
