@@ -61,7 +61,9 @@ STATE_NS = 50_000_000
 URGENT_NS = 30_000_000
 """How long after an answer snapshots are sent as they come, at most: until one shows what was acknowledged."""
 LOOK_NS = 500_000
-"""How often to look for them."""
+"""How often to look for them, and how long after an answer first: who asks again within that does not read."""
+IN_A_ROW_NS = 2_000_000
+"""How seldom they are sent to who asks without a pause, whose answers they would delay."""
 TOLD = 50
 """The driver, which runs the lease out if we cannot, knows the client's last word but for this part of the lease."""
 JOURNAL_NS = 20_000_000
@@ -481,8 +483,11 @@ class Gateway:
         if held.ahead >= link.WINDOW or session.held.get(held.handle) is not held:  # the session may just have ended
             return now_ns + IDLE_NS
         urgent = held.owed_ns > 0 and session.urgent_ns > now_ns
-        if not (must or urgent or held.woken) and now_ns - held.sent_ns < self._idle_ns:
-            return held.sent_ns + self._idle_ns
+        next_ns = held.sent_ns + self._idle_ns
+        if urgent:
+            next_ns = min(session.urgent_ns - URGENT_NS + LOOK_NS, held.sent_ns + IN_A_ROW_NS)
+        if not (must or held.woken) and now_ns < next_ns:
+            return next_ns
         condition = held.node.page.condition()
         is_late = now_ns - held.sent_ns >= STATE_NS
         if held.node.page.head > held.cursor or must or held.woken or is_late or held.state != condition[1:3]:

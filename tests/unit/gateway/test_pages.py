@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import pytest
 from gateway_rig import BEN, MS, World
 
@@ -64,6 +66,29 @@ def test_many_nodes_that_nobody_waits_for_take_no_more_than_a_few(world: World) 
 
     few, many = frames(IDLE_NODES), frames(6 * IDLE_NODES)
     assert few == pytest.approx(IDLE_NODES * 200, rel=0.2) and many < 1.3 * few
+
+
+def test_who_asks_in_a_row_is_sent_few_readings_and_the_last_at_once(world: World) -> None:
+    """Each costs an answer some of its time, and who asks again at once has not read."""
+    world.begin(b"a")
+    node, handle = world.open(b"a", 5), 5
+    sent: list[int] = []
+    for step in range(400):  # 0.1 ms each; the last 10 ms ask nothing
+        world.now_ns += MS // 10
+        if step % 10 == 0:
+            node.publish(world.now_ns)
+        if step % 3 == 0 and step < 300:
+            last_ns = world.now_ns
+            world.gateway.driver_packet(world.session(b"a"), handle, reply(step + 1, None, world.now_ns))
+        if world.gateway.due_ns <= world.now_ns:
+            world.gateway.tick()
+        for _ in range(world.kinds(b"a").count(Down.UPDATE)):
+            sent.append(world.now_ns)
+            world.frame(b"a", Up.CREDIT, handle)
+        world.sent[b"a"].clear()
+    in_a_row = [at_ns for at_ns in sent if at_ns <= last_ns]
+    assert all(1.9 * MS <= after - before <= 4 * MS for before, after in itertools.pairwise(in_a_row))
+    assert len(in_a_row) > 8 and min(at_ns for at_ns in sent if at_ns > last_ns) - last_ns < 1.6 * MS
 
 
 def test_of_large_snapshots_as_many_go_at_once_as_the_client_confirms(
