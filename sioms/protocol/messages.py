@@ -46,10 +46,19 @@ _SHORT, _SHORT_HEAD = 64, b"\x96\x00"
 """Bytes of a short reply at most, and how it begins: an array of six, the first of them 0."""
 
 if "site" in sys.modules:
-    from msgpack import packb, unpackb
+    from msgpack import Packer, unpackb
+
+    _packers: list[Packer] = []
+    """Those that nobody uses now: making one takes as long as packing with it."""
 
     def _pack(value: object) -> bytes:
-        packed: bytes = packb(value, use_bin_type=True)
+        try:
+            packer = _packers.pop()
+        except IndexError:
+            packer = Packer(use_bin_type=True)
+        packed: bytes = packer.pack(value)
+        if len(packed) <= MAX_PACKET:  # it keeps as much memory as it has needed
+            _packers.append(packer)
         return packed
 
     def _unpack(data: bytes, most: int = MAX_UNPACKED) -> Any:
