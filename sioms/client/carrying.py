@@ -10,6 +10,7 @@ Concurrency: any threads of the process that has made the session; none of a for
 
 from __future__ import annotations
 
+import ctypes
 import errno
 import os
 import threading
@@ -21,10 +22,10 @@ from _signal import (  # type: ignore[import-not-found]  # that of ``signal`` ma
     SIGFPE,
     SIGILL,
     SIGSEGV,
-    pthread_sigmask,
     valid_signals,
 )
 from collections.abc import Callable, Sequence
+from functools import partial
 from select import POLLIN, poll
 from time import monotonic
 from typing import TYPE_CHECKING, Protocol, Self
@@ -38,7 +39,14 @@ WHY_MS = 1000
 """How long the session's own thread may take to say why a channel has ended [ms]."""
 END_S = 5.0
 """How long a thread of the program may take to notice the end of the session that it moves frames of [s]."""
+NOBODY = -1
+"""A channel that is none."""
 MAIN = threading.main_thread().ident
+_Mask = ctypes.c_uint64 * 16
+_sigmask = ctypes.PyDLL(None).pthread_sigmask
+"""That of the module ``signal`` takes 7 us, as it makes sets of numbers."""
+_sigmask.argtypes = ctypes.c_int, ctypes.POINTER(_Mask), ctypes.POINTER(_Mask)
+_ALL = _Mask(sum(1 << (number - 1) for number in ALL))
 
 
 class Bridge(Protocol):
@@ -53,8 +61,8 @@ class Bridge(Protocol):
     def say(self, channel: int, packet: bytes) -> None:
         """Send a packet of the program, 0 = to the daemon; raises OSError: EPIPE, that channel has ended."""
 
-    def serve(self) -> None:
-        """Move what has come."""
+    def serve(self, channel: int) -> bytes:
+        """Move what has come; return an answer for who waits on a channel, b"": what is for it lies in its socket."""
 
     def watch(self, whether: bool) -> None:
         """Have the session's own thread watch the link, or not."""
@@ -84,7 +92,7 @@ class Carrying:
         """Whether this is a forked child, in which the session's own thread is not."""
         return os.getpid() != self._pid
 
-    def alone(self, act: Callable[[], None]) -> None:
+    def alone(self, act: Callable[[], object]) -> None:
         """Do something with the link, whole, in a thread of the program.
 
         Raises:
@@ -92,19 +100,25 @@ class Carrying:
         """
         if self.is_a_childs:
             raise OSError(errno.EPROTO, "a forked child cannot use the session of its parent; open another one")
-        before = pthread_sigmask(SIG_BLOCK, ALL) if threading.get_ident() == MAIN else None
+        if threading.get_ident() != MAIN:
+            self._whole(act)
+            return
+        before = _Mask()
         try:
-            with self.lock:
-                try:
-                    act()
-                except OSError:
-                    raise
-                except BaseException as error:  # of a signal's handler: another thread has got that
-                    self.bridge.spoil(f"{type(error).__name__} while a frame was moved")
-                    raise
+            _sigmask(SIG_BLOCK, _ALL, before)
+            self._whole(act)
         finally:
-            if before is not None:
-                pthread_sigmask(SIG_SETMASK, before)
+            _sigmask(SIG_SETMASK, before, None)
+
+    def _whole(self, act: Callable[[], object]) -> None:
+        with self.lock:
+            try:
+                act()
+            except OSError:
+                raise
+            except BaseException as error:  # of a signal's handler: another thread has got that
+                self.bridge.spoil(f"{type(error).__name__} while a frame was moved")
+                raise
 
     def end(self, release: Callable[[], None]) -> None:
         """Let go of the link when no thread of the program moves its frames; none will any more."""
@@ -122,10 +136,11 @@ class Carrier:
         sock: the program's end of its socket, in which answers arrive.
     """
 
-    __slots__ = ("_both", "_carrying", "_channel", "_fd", "_own")
+    __slots__ = ("_both", "_carrying", "_channel", "_fd", "_found", "_own")
 
     def __init__(self, carrying: Carrying, channel: int, sock: socket) -> None:
         self._carrying, self._channel, self._fd = carrying, channel, sock.fileno()
+        self._found = b""
         self._own, self._both = poll(), poll()
         for each in (self._own, self._both):
             each.register(self._fd, POLLIN)
@@ -147,24 +162,36 @@ class Carrier:
             self._own.poll(WHY_MS)
             raise
 
-    def wait(self, timeout_s: float) -> None:
-        """Wait until an answer has arrived, and move frames meanwhile unless another thread of the program does."""
+    def wait(self, timeout_s: float) -> bytes:
+        """Wait until an answer has arrived, and move frames meanwhile unless another thread of the program does.
+
+        Returns:
+            The answer, b"": what there is lies in the socket. One thread at a time waits on a channel.
+        """
+        if not self._found:
+            if self._carrying.leading.acquire(False):
+                self._lead(monotonic() + timeout_s)
+            else:
+                self._own.poll(1e3 * timeout_s)
+        found, self._found = self._found, b""  # kept until here: who is interrupted finds it with the next call
+        return found
+
+    def _lead(self, deadline: float) -> None:
         carrying = self._carrying
-        bridge, deadline = carrying.bridge, monotonic() + timeout_s
-        if not carrying.leading.acquire(False):
-            self._own.poll(1e3 * timeout_s)
-            return
         try:
-            bridge.watch(False)
-            while (left_s := deadline - monotonic()) > 0:
+            carrying.bridge.watch(False)
+            while not self._found and (left_s := deadline - monotonic()) > 0:
                 ready = self._both.poll(1e3 * left_s)
-                if any(fd == self._fd for fd, _ in ready):
+                if self._fd in dict(ready):
                     return
                 if ready:
-                    carrying.alone(bridge.serve)
+                    carrying.alone(self._serve)
         finally:
-            bridge.watch(True)
+            carrying.bridge.watch(True)
             carrying.leading.release()
+
+    def _serve(self) -> None:
+        self._found = self._carrying.bridge.serve(self._channel)
 
 
 class Led:
@@ -202,4 +229,4 @@ class Led:
                     left.remove(fd)
                     poller.unregister(fd)
                 elif fd in self._sessions:
-                    self._sessions[fd].alone(self._sessions[fd].bridge.serve)
+                    self._sessions[fd].alone(partial(self._sessions[fd].bridge.serve, NOBODY))

@@ -265,8 +265,8 @@ class Channel:
             if self.fellows:
                 self._keep_others()
             if self.carrier is not None:
-                self.carrier.wait(self._timeout)
-            packet = self._sock.recv(MAX_PACKET, self._flags)
+                packet = self.carrier.wait(self._timeout)
+            packet = packet or self._sock.recv(MAX_PACKET, self._flags)
             message = short_reply(packet, number)
             if message is None:
                 self._sort(*self._decoded(packet, Descriptors()))
@@ -473,10 +473,9 @@ class Channel:
                 if timeout <= 0:
                     return False
             self._set_timeout(timeout)
-            if self.carrier is not None:
-                self.carrier.wait(timeout)
+            packet = b"" if self.carrier is None else self.carrier.wait(timeout)
             try:
-                message, fds = self._packet(self._flags)
+                message, fds = self._decoded(packet, Descriptors()) if packet else self._packet(self._flags)
             except BlockingIOError:
                 if self.keepalive_s:
                     self.keepalive()

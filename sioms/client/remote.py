@@ -20,7 +20,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
 from typing import Any, Protocol
 
@@ -33,7 +33,7 @@ from sioms.protocol.messages import MAX_PACKET, ClientVerb, refusal
 from sioms.protocol.page import REASON_SIZE
 from sioms.protocol.text import printable
 
-from .carrying import ALL, Carrier, Carrying
+from .carrying import ALL, NOBODY, Carrier, Carrying
 from .far import Far, FarJournal
 from .places import place_of
 
@@ -82,14 +82,22 @@ class Link(Protocol):
     def stop(self, frame: bytes) -> None:
         """Send a stop, which overtakes all other frames."""
 
-    def frames(self) -> Iterator[bytes]:
-        """Take what has come."""
+    @property
+    def pending(self) -> bool:
+        """Whether frames wait of which no descriptor tells, since one was sent."""
 
-    def lost(self, due: bool) -> str:
+    def frames(self, ready: Collection[int] = ()) -> Iterator[bytes]:
+        """Take what has come.
+
+        Args:
+            ready: descriptors that tell of something, the others do not; none: look for all.
+        """
+
+    def lost(self, ready: Collection[int] | None = None) -> str:
         """Return why the link has ended, '' if it has not.
 
         Args:
-            due: whether to look, whether or not descriptors tell of something.
+            ready: as of ``frames``; None: look, whatever descriptors tell.
         """
 
     def close(self) -> None:
@@ -158,6 +166,7 @@ class _Bridge:
         self._due_ns = 0
         self.carrying = Carrying(self)
         self._is_over = False
+        self._waits, self._answer = NOBODY, b""
         self._links, self._epoll = select.epoll(), select.epoll()
         for fd in carrier.fds:
             self._links.register(fd, select.EPOLLIN)
@@ -197,7 +206,7 @@ class _Bridge:
         if not came:
             self._epoll.poll(min(left_s, at_most_s))
         came = self._take_all() or came
-        if self._last_word is None and (why := self._link.lost(True)):
+        if self._last_word is None and (why := self._link.lost()):
             came = self._take_all() or came  # the gateway may have said why
             self._last_word = self._last_word or (errno.EIO, why)
         if self._last_word is not None:
@@ -251,7 +260,7 @@ class _Bridge:
         now_ns = time.monotonic_ns()
         due = now_ns >= self._due_ns or self._stop is not None
         if due or self.link_fd in ready:
-            self._look_for_loss(due)
+            self._look_for_loss(None if due else self._ready())
         if due:
             self._look(now_ns)
             self._due_ns = now_ns + int(link.PING_S * 1e9 / 4)
@@ -259,8 +268,12 @@ class _Bridge:
         self._take_all()
         return True
 
-    def _look_for_loss(self, due: bool) -> None:
-        if why := self._link.lost(due):
+    def _ready(self) -> list[int]:
+        """Return the descriptors of the link that are ready."""
+        return [fd for fd, _ in self._links.poll(0)]
+
+    def _look_for_loss(self, ready: Collection[int] | None = None) -> None:
+        if why := self._link.lost(ready):
             self._take_all()  # the gateway may have said why
             self._lose(why)
 
@@ -289,22 +302,28 @@ class _Bridge:
                 self._send(Up.PACKET, channel, packet)
             else:
                 self._to_daemon(packet)
-            self._take_all()
+            if self._link.pending:
+                self._take_all()
         except (OSError, MalformedFrame) as error:
             self.spoil(str(error))
             raise BrokenPipeError(errno.EPIPE, str(error)) from None
 
-    def serve(self) -> None:
-        """Move what has come."""
+    def serve(self, channel: int) -> bytes:
+        """Move what has come; return an answer for who waits on a channel, b"": what is for it lies in its socket."""
         if self._is_over or self._last_word:
-            return
+            return b""
+        self._waits, self._answer = channel, b""
         try:
-            self._look_for_loss(False)
-            self._take_all()
+            if ready := self._ready():
+                self._look_for_loss(ready)
+                self._take_all(ready)
         except (OSError, MalformedFrame) as error:
             self.spoil(str(error))
+        finally:
+            self._waits = NOBODY
         if self._last_word:
             os.eventfd_write(self._spoilt, 1)
+        return self._answer
 
     # --- the session's thread --------------------------------------------------------------------
 
@@ -321,10 +340,10 @@ class _Bridge:
             packet, self._stop = self._stop[1], None
             self._send(Up.PACKET, body=packet)
 
-    def _take_all(self) -> bool:
+    def _take_all(self, ready: Collection[int] = ()) -> bool:
         """Take what has come; return whether something has."""
         came = False
-        for frame in self._link.frames():
+        for frame in self._link.frames(ready):
             self._take(frame)
             came = True
         return came
@@ -387,12 +406,12 @@ class _Bridge:
                 self._publish(far, Update.take(body, far.shape.slot_size))
             case Down.PACKET if channel and far is not None:
                 if body:
-                    far.ours.send(body)  # a program that does not read its answers ends its session
+                    self._hand_over(channel, far.ours, body)
                 else:
                     self._end_of(far, channel)
             case Down.PACKET if not channel:
                 self._stop = None
-                self.ours.send(body)
+                self._hand_over(channel, self.ours, body)
             case Down.OPENED:
                 shape, packet = link.take_opened(body)
                 far = self._nodes[channel] = Far(shape)
@@ -414,6 +433,15 @@ class _Bridge:
             case Down.END:
                 word = channel or errno.EIO, printable(body.decode("utf-8", "replace"), 1024)
                 self._last_word = self._last_word or word  # the first says why; what came in between gets another one
+
+    def _hand_over(self, channel: int, ours: socket.socket, packet: bytes) -> None:
+        """Give a packet to the program: the first answer to who waits for one, and now moves frames, without a socket.
+        A last word comes behind what lies there.
+        """
+        if channel == self._waits and not self._answer and packet[1:3] != b"\0\0":
+            self._answer = packet
+        else:
+            ours.send(packet)  # a program that does not read its answers ends its session
 
     def _confirm(self, far: Far, handle: int) -> None:
         """Confirm sets of snapshots: half a window at a time, which spares the gateway every second frame."""

@@ -14,7 +14,7 @@ import socket
 import ssl
 import threading
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import Any
 from weakref import WeakSet
@@ -139,7 +139,12 @@ class ZenohLink:
         with suppress(zenoh.ZError):  # it goes the other way then
             self._stop.put(frame)
 
-    def frames(self) -> Iterator[bytes]:
+    @property
+    def pending(self) -> bool:
+        """Nothing takes the edge off a descriptor."""
+        return False
+
+    def frames(self, ready: Collection[int] = ()) -> Iterator[bytes]:
         """Take what has come."""
         with suppress(BlockingIOError):
             os.eventfd_read(self._came)
@@ -148,7 +153,7 @@ class ZenohLink:
             self._bytes -= len(frame)
             yield frame
 
-    def lost(self, due: bool) -> str:
+    def lost(self, ready: Collection[int] | None = None) -> str:
         """Return why the connection has ended, '' if it has not."""
         _hurry.look()
         return self._lost

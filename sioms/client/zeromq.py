@@ -8,9 +8,8 @@ from __future__ import annotations
 import errno
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import suppress
-from select import POLLIN, poll
 from typing import Any
 
 import zmq
@@ -80,8 +79,6 @@ class ZmqLink:
         self._monitor_fd = int(self._monitor.getsockopt(zmq.FD))
         fds = [int(sock.getsockopt(zmq.FD)) for sock in (self._requests, self._stops)]
         self.fds: tuple[int, ...] = (*fds, self._monitor_fd)
-        self._told_of_end = poll()
-        self._told_of_end.register(self._monitor_fd, POLLIN)
         try:
             self._shake_hands(what, timeout_s)
         except BaseException:
@@ -123,15 +120,27 @@ class ZmqLink:
         with suppress(zmq.ZMQError):  # it goes the other way then
             self._stops.send(frame, zmq.DONTWAIT)
 
-    def frames(self) -> Iterator[bytes]:
-        """Take what has come. Sending takes the edge off the descriptors: it is looked for after that."""
-        for sock in (self._stops, self._requests):
-            while int(sock.getsockopt(zmq.EVENTS)) & READABLE:
-                yield sock.recv(zmq.DONTWAIT)
+    @property
+    def pending(self) -> bool:
+        """Whether frames wait of which no descriptor tells: sending takes the edge off that."""
+        return bool(int(self._requests.getsockopt(zmq.EVENTS)) & READABLE)
 
-    def lost(self, due: bool) -> str:
+    def frames(self, ready: Collection[int] = ()) -> Iterator[bytes]:
+        """Take what has come."""
+        for sock, fd in ((self._stops, self.fds[1]), (self._requests, self.fds[0])):
+            is_ready = fd in ready  # asking takes as long as trying
+            if ready and not is_ready and sock is self._stops:  # who takes frames may have sent some
+                continue
+            try:
+                while is_ready or int(sock.getsockopt(zmq.EVENTS)) & READABLE:
+                    is_ready = False
+                    yield sock.recv(zmq.DONTWAIT)
+            except zmq.Again:
+                continue
+
+    def lost(self, ready: Collection[int] | None = None) -> str:
         """Return why the connection has ended, '' if it has not."""
-        if not due and not self._told_of_end.poll(0):
+        if ready is not None and self._monitor_fd not in ready:
             return ""
         while int(self._monitor.getsockopt(zmq.EVENTS)) & READABLE:
             happened: Any = parse_monitor_message(self._monitor.recv_multipart())

@@ -75,7 +75,11 @@ class ZeroMq:
         bind(self._router, host, port)
         bind(stops, host, port + 1)
         self._router_fd = int(self._router.getsockopt(zmq.FD))
-        loop.add(self._router_fd, lambda: None)
+        self._is_ready = False
+        loop.add(self._router_fd, self._tell_ready)
+
+    def _tell_ready(self) -> None:
+        self._is_ready = True
 
     def start(self) -> None:
         """Begin to take stops."""
@@ -103,10 +107,15 @@ class ZeroMq:
     def take(self) -> bool:
         """Take frames of clients; return whether there are more."""
         router, known, gateway = self._router, self._known, self._gateway
+        is_ready, self._is_ready = self._is_ready, False  # asking takes as long as trying
         for _ in range(TURN):
-            if not int(router.getsockopt(zmq.EVENTS)) & READABLE:
+            if not is_ready and not int(router.getsockopt(zmq.EVENTS)) & READABLE:
                 return False
-            peer = router.recv()
+            is_ready = False
+            try:
+                peer = router.recv(zmq.DONTWAIT)
+            except zmq.Again:
+                return False
             if peer in known and peer in gateway.sessions:
                 frame = router.recv()
             else:

@@ -10,17 +10,17 @@ import socket
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from typing import Any
 
 import pytest
 
-from sioms.client.carrying import Carrier, Led
+from sioms.client.carrying import NOBODY, Carrier, Led
 from sioms.client.channel import Call, Channel
 from sioms.client.remote import _Bridge
 from sioms.protocol import link, verbs
 from sioms.protocol.link import Down, Up
-from sioms.protocol.messages import decode, reply
+from sioms.protocol.messages import decode, refusal, reply
 
 
 class Link:
@@ -35,6 +35,7 @@ class Link:
         self.why = ""
         self.keeps = False
         self.during: Callable[[], None] = lambda: None
+        self.while_taken: Callable[[], None] = lambda: None
         self._frames: deque[bytes] = deque()
 
     def send(self, frame: bytes) -> None:
@@ -57,14 +58,19 @@ class Link:
     def stop(self, frame: bytes) -> None:
         self.send(frame)
 
-    def frames(self) -> Iterator[bytes]:
+    @property
+    def pending(self) -> bool:
+        return bool(self._frames)
+
+    def frames(self, ready: Collection[int] = ()) -> Iterator[bytes]:
         with contextlib.suppress(BlockingIOError):
             os.eventfd_read(self.came)
         while self._frames:
             self.taken_by.append(threading.get_ident())
+            self.while_taken()
             yield self._frames.popleft()
 
-    def lost(self, due: bool) -> str:
+    def lost(self, ready: Collection[int] | None = None) -> str:
         return self.why
 
     def close(self) -> None:
@@ -169,6 +175,31 @@ def test_a_signal_ends_the_wait_and_not_the_session(rig: Rig) -> None:
         rig.ask(5.0)
     rig.link.keeps = False
     assert rig.ask() == "answer 2"
+
+
+@pytest.mark.usefixtures("interrupts")
+def test_a_signal_behind_an_answer_that_has_come_loses_no_answer(rig: Rig) -> None:
+    """It is given to who moves frames, without a socket, and may be another thread's."""
+    rig.ask()
+    rig.link.keeps = True
+    number = rig.channel.send(Call("list", verbs.List()))
+    rig.link.while_taken = lambda: signal.raise_signal(signal.SIGALRM)
+    threading.Timer(0.05, rig.link.bring, [number]).start()
+    with pytest.raises(Interrupted):
+        rig.ask(5.0)
+    rig.link.while_taken = lambda: None
+    assert rig.channel.wait(number, Call("list", verbs.List(), limit_s=0.2)).value == f"answer {number}"
+
+
+def test_who_moves_frames_has_an_answer_without_a_socket_and_a_last_word_behind_all(rig: Rig) -> None:
+    rig.ask()
+    taken: list[bytes] = []
+    rig.bridge._waits = 0
+    for packet in (refusal(0, errno.EIO, "it ends"), reply(7, "one"), reply(8, "two")):
+        rig.bridge._hand_over(0, rig.bridge.ours, packet)
+    rig.bridge._waits = NOBODY
+    taken = [rig.channel._sock.recv(1000, socket.MSG_DONTWAIT) for _ in range(2)]
+    assert rig.bridge._answer == reply(7, "one") and taken == [refusal(0, errno.EIO, "it ends"), reply(8, "two")]
 
 
 @pytest.mark.usefixtures("interrupts")
