@@ -141,8 +141,8 @@ class ZenohLink:
 
     @property
     def pending(self) -> bool:
-        """Nothing takes the edge off a descriptor."""
-        return False
+        """Whether frames wait."""
+        return bool(self._frames)
 
     def frames(self, ready: Collection[int] = ()) -> Iterator[bytes]:
         """Take what has come."""
