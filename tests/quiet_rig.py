@@ -51,10 +51,11 @@ class Cell:
         self.instants = np.zeros(2, dtype=np.int64)
         steps = self.driver.quiet_steps(self.pages, self.instants)
         self.steps = steps if by_steps else None
-        self.number, self.quiet = 0, 0
+        self.number, self.quiet, self.begun = 0, 0, 0
 
     def tick(self, now_ns, awaited=False):
         self.number += 1
+        self.begun = 0
         if not (self.steps and self.by_step(now_ns, awaited=awaited)):
             self.driver.tick(now_ns)
             for block in self.driver.blocks:
@@ -81,6 +82,7 @@ class Cell:
             return False
         done = steps.tick(steps.record, now_ns, now_ns, self.number) == 0
         self.quiet += done
+        self.begun = steps.record.plans.started * done
         slackens = done and steps.slack(steps.record, now_ns, now_ns + PERIOD_NS, 0)
         self.pages.take_back()
         steps.resume()

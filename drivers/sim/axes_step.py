@@ -197,8 +197,11 @@ def brake_axes(s: SimulatedAxes, now_ns: int, latches: int, since_ns: int) -> in
 
 @step
 def advance_axes(s: SimulatedAxes, now_ns: int, until_ns: int, unused: int) -> int:
-    """Let the world go on to the next tick. Returns 1 when that takes more than free motion."""
-    return 0 if s.ahead else move_axes(s)
+    """Let the world go on to the next tick. Returns 1 when that takes more than free motion, or plans can be made ahead
+    of commands that have begun.
+    """
+    left = 0 if s.ahead else move_axes(s)
+    return left or s.plans.started > 0
 
 
 @step

@@ -158,10 +158,12 @@ class AxesWorld:
     def plan_early(self) -> bool:
         """Plan profiles ahead long before the next tick, or when that is late anyway; return whether there were any.
 
-        Without the plans the late tick, and all after it, would be the loop's, and later still.
+        Without the plans the late tick, and all after it, would be the loop's, and later still. Where ticks are always
+        as near as that, each would be.
         """
         left_ns = self.last_ns + self.tick_ns - time.monotonic_ns()
-        return not 0 <= left_ns <= 2 * _SLACK_NS and self.bank.plan_ahead(_PLANS) > 0
+        near_ns = 2 * _SLACK_NS if self.tick_ns > 2 * _SLACK_NS else self.tick_ns // 10
+        return not 0 <= left_ns <= near_ns and self.bank.plan_ahead(_PLANS) > 0
 
     def is_at_rest(self) -> bool:
         """Whether world and command are at a fixed point; turns that are left out then need not be made up for."""

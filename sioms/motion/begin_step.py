@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 
 from sioms.native.language import step
-from sioms.protocol.flags import AxisStatus
 
 from .axis_step import FORCE, POSITION
-from .plan_step import Plans, load, look_at_plan
+from .plan_step import Plans, begin_other, look_at_plan
 from .stop_step import is_behind
 from .store import UNCUT_NS
 
@@ -63,20 +62,11 @@ def begin(s: Plans, i: int, now_ns: int) -> int:
     a = s.loop
     kind = a.kind[i]
     late = is_behind(a, i)
-    row = s.row[i] ^ 1
-    s.row[i] = row
     s.start_ns[i] = now_ns
     s.start_fraction[i] = 0.0
-    s.segment[i] = 0
-    a.segment_ns[i] = now_ns
     s.cut_ns[i] = UNCUT_NS
-    load(s, i)
+    begin_other(s, i)
     if late and not a.stepper[i]:  # how far it was behind before must not push back
         a.error[i] = a.present[i] - (a.position[i] + a.velocity[i] * ((now_ns - max(a.last_ns, a.seen_ns)) * 1e-9))
-    a.kind[i] = s.row_kind[row]
     a.begun[i] += 1
-    s.outcome[i] = 0
-    s.stopped[i] = False
-    a.event_status[i] = a.latched[i] | AxisStatus.MOVING
-    s.in_motion[i] = True
     return kind >= POSITION and kind < FORCE

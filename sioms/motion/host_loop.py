@@ -330,7 +330,8 @@ class AxisBank(Bank):
             or self._law.force_ends.any or sequencer.has_work or self.keeper is not None
         ):  # fmt: skip
             return False
-        self.plans.braked_ns = 0
+        self.plans.braked_ns = self.plans.started = 0
+        self.plans.follows = sequencer.is_plain and not self._law.any_braced
         loop.any_guard, loop.next_ns, loop.last_ns = sequencer.any_guard, sequencer.store.next_ns, self._last_ns
         return True
 

@@ -1,4 +1,5 @@
-"""What becomes of plans where nothing is decided: the segments that follow, and ends behind which nothing waits.
+"""What becomes of plans where nothing is decided: the segments that follow, ends behind which nothing waits, and
+commands that are planned and begin where the one before ends.
 
 ``Sequencer.advance`` does the same with all plans, ``Sequencer.settled`` with axes that come to rest behind their
 set-points. What is told of it is the bank's, which does that later, with the instants that are noted here.
@@ -14,6 +15,7 @@ from sioms.native.numbers import whole
 from sioms.protocol.flags import AxisStatus
 
 from .axis_step import FORCE, HOLD, POSITION, REST, SETTLING, Loop
+from .pace import PIECES
 from .profile import MAX_SEGMENTS
 from .store import NEVER_NS, UNCUT_NS
 
@@ -32,6 +34,9 @@ class Plans(Record):
     an axis has ended, ``ended_ns``, and when it came to rest, ``idle_ns``, by the ticks in which that was found [ns];
     0: it has not. ``untold``: how much of it the bank has yet to tell. ``state``: (3,) in which a command, or a stop,
     begins.
+
+    ``follows``: steps may begin commands that are ``ready``, planned in the other row of their axis, and ``started`` of
+    them they have, at ``started_ns`` [ns], 0: none on this axis. ``tick_s``: nominal period [s].
     """
 
     loop: Loop
@@ -59,19 +64,49 @@ class Plans(Record):
     ended_ns: Integers
     idle_ns: Integers
     untold: int
+    follows: int
+    ready: Flags
+    gated_synch: Flags
+    gated_marker: Flags
+    row_guard: Flags
+    row_sets: Flags
+    started_ns: Integers
+    started: int
+    tick_s: float
     state: Floats
 
 
 @step
 def may_go_on(s: Plans, now_ns: int) -> int:
-    """Return whether all that ends by now is a segment with another behind it, or a plan with nothing behind it."""
+    """Return whether all that ends by now is a segment with another behind it, a plan with nothing behind it, or one
+    with another that is planned.
+    """
     a = s.loop
     if now_ns < a.next_ns:
         return 1
     for i in range(a.n):
-        if s.end_ns[i] <= now_ns and plan_ends(s, i, now_ns) and not may_end(s, i):
+        if s.end_ns[i] <= now_ns and plan_ends(s, i, now_ns) and not (may_end(s, i) or may_follow(s, i, now_ns)):
             return 0
     return 1
+
+
+@step
+def may_follow(s: Plans, i: int, now_ns: int) -> int:
+    """Return whether nothing is left to decide when the command that waits on an axis begins where its plan ends: it is
+    planned, free to begin, not short, goes on until now at least, and puts nothing else in force.
+    """
+    a = s.loop
+    row = s.row[i]
+    other = row ^ 1
+    if not s.follows or not s.ready[i] or not a.has_head[i] or s.gated_synch[i] or s.gated_marker[i]:
+        return 0
+    if s.awaited or s.ended_ns[i] or s.idle_ns[i] or s.started_ns[i] or s.cut_ns[i] != UNCUT_NS:
+        return 0
+    if a.kind[i] < POSITION or a.kind[i] >= FORCE or s.row_signals[row] or s.row_checked[row]:
+        return 0
+    if s.row_kind[other] == FORCE or s.row_guard[other] or s.row_sets[other] or s.duration[row] * PIECES < s.tick_s:
+        return 0
+    return (s.duration[row] + s.duration[other]) * 1e9 > now_ns - s.start_ns[i] + 1
 
 
 @step
@@ -106,6 +141,8 @@ def go_on(s: Plans, now_ns: int) -> int:
                 a.segment_ns[i] = s.end_ns[i]
                 s.segment[i] += 1
                 load(s, i)
+            elif may_follow(s, i, now_ns):
+                begin_next(s, i, now_ns)
             else:
                 end_plan(s, i, now_ns)
         next_ns = min(next_ns, s.end_ns[i])
@@ -120,9 +157,7 @@ def end_plan(s: Plans, i: int, now_ns: int) -> int:
     row = s.row[i]
     if a.kind[i] >= POSITION and a.kind[i] < FORCE:
         s.ended_ns[i] = now_ns
-    total = s.start_fraction[i] + s.duration[row] * 1e9
-    s.start_ns[i] += int(whole(total))
-    s.start_fraction[i] = total - whole(total)
+    pass_over(s, i)
     s.segment[i] = 0
     a.segment_ns[i] = s.start_ns[i]
     position = s.final[3 * row]
@@ -136,6 +171,48 @@ def end_plan(s: Plans, i: int, now_ns: int) -> int:
     else:
         s.idle_ns[i] = now_ns
         become(s, i, HOLD)
+    return 0
+
+
+@step
+def pass_over(s: Plans, i: int) -> int:
+    """Put the begin of the plan of an axis to where it ends."""
+    total = s.start_fraction[i] + s.duration[s.row[i]] * 1e9
+    s.start_ns[i] += int(whole(total))
+    s.start_fraction[i] = total - whole(total)
+    return 0
+
+
+@step
+def begin_next(s: Plans, i: int, now_ns: int) -> int:
+    """Begin the command that waits on an axis where its plan ends."""
+    a = s.loop
+    s.ended_ns[i] = now_ns
+    s.started_ns[i] = now_ns
+    pass_over(s, i)
+    begin_other(s, i)
+    a.guard[i] = False
+    a.has_head[i] = False
+    s.ready[i] = False
+    s.started += 1
+    s.untold += 1
+    return 0
+
+
+@step
+def begin_other(s: Plans, i: int) -> int:
+    """Let the plan in the other row of an axis begin, at its ``start_ns``, and show that it moves."""
+    a = s.loop
+    row = s.row[i] ^ 1
+    s.row[i] = row
+    s.segment[i] = 0
+    a.segment_ns[i] = s.start_ns[i]
+    load(s, i)
+    a.kind[i] = s.row_kind[row]
+    s.outcome[i] = 0
+    s.stopped[i] = False
+    a.event_status[i] = a.latched[i] | AxisStatus.MOVING
+    s.in_motion[i] = True
     return 0
 
 

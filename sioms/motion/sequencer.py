@@ -95,9 +95,13 @@ class Sequencer:
         self._hardest = np.array([s.acceleration_max for s in settings])
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
-        self._ended_ns, self._idle_ns = np.zeros(n, dtype=np.int64), np.zeros(n, dtype=np.int64)
-        """When steps have found ends that are yet to be told [ns]; 0: they have not."""
+        self._ended_ns, self._started_ns, self._idle_ns = (np.zeros(n, dtype=np.int64) for _ in range(3))
+        """When steps have found ends and begins that are yet to be told [ns]; 0: they have not."""
+        self._noted = (
+            (EventKind.ENDED, self._ended_ns), (EventKind.STARTED, self._started_ns), (EventKind.IDLE, self._idle_ns),
+        )  # fmt: skip
         self.pace = Pace(law.begun, tick_s)
+        self._tick_s = tick_s
 
     # -- what the bank asks for ---------------------------------------------------------------
 
@@ -198,17 +202,23 @@ class Sequencer:
             row_kind=self._row_kind, row_signals=self._row_signals, row_checked=self._row_checked,
             row_taken=self._row_taken, stopped=self.stopped, fresh=fresh,
             braked_ns=0, outcome=self.outcome, in_motion=self._in_motion, awaited=0, ended_ns=self._ended_ns,
-            idle_ns=self._idle_ns, untold=0, state=np.zeros(3), **store.segments,
+            idle_ns=self._idle_ns, untold=0, follows=0, ready=self._ready, gated_synch=self._queue.gated_synch,
+            gated_marker=self._queue.gated_marker, row_guard=self._row_guard, row_sets=self._row_sets,
+            started_ns=self._started_ns, started=0, tick_s=self._tick_s, state=np.zeros(3), **store.segments,
         )  # fmt: skip
 
     def tell_ends(self) -> None:
-        """Tell of the ends that steps have found, in their order; those of a tick together."""
-        noted = ((EventKind.ENDED, self._ended_ns), (EventKind.IDLE, self._idle_ns))
-        found = [(at_ns, i) for i, (_, when_ns) in enumerate(noted) for at_ns in set(when_ns.tolist()) if at_ns]
-        for at_ns, i in sorted(found):
-            kind, when_ns = noted[i]
-            self._queue.emit(kind, np.flatnonzero(when_ns == at_ns), at_ns)
-        self._ended_ns[:] = self._idle_ns[:] = 0
+        """Tell of the ends and begins that steps have found, in their order; those of a tick together."""
+        found: list[tuple[int, EventKind, Axes]] = []
+        for kind, noted_ns in self._noted:
+            axes = np.flatnonzero(noted_ns)
+            when_ns = noted_ns[axes]
+            found += [(at_ns, kind, axes[when_ns == at_ns]) for at_ns in set(when_ns.tolist())]
+            if kind == EventKind.STARTED:
+                self._todo.update(dict.fromkeys(axes.tolist()))
+            noted_ns[axes] = 0
+        for at_ns, kind, axes in sorted(found, key=lambda each: each[0]):  # those of a tick in the order of kinds
+            self._queue.emit(kind, axes, at_ns)
         self._settle_masks()
 
     def after_stop(self) -> None:

@@ -53,6 +53,49 @@ def test_steps_show_what_the_driver_shows(monkeypatch):
     assert quiet.driver.blocks[2].edges[0] > 10, "beams were broken, and free again"
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_commands_that_wait_begin_by_steps_as_by_the_driver(monkeypatch, seed):
+    """Rows of commands, long and shorter than a tick, with gains, limits and force modes among them, stops between."""
+    monkeypatch.setattr("sioms.drivers.sim.axes_world._SLACK_NS", -(10**18))  # plans are made ahead at any time
+    plain, quiet = Cell(False), Cell(True)
+    rng, now_ns, refused, begun, started = np.random.default_rng(seed), 1_000_000_000, 0, 0, set()
+    for tick in range(3000):
+        now_ns += PERIOD_NS * (1 if rng.random() < 0.98 else int(rng.choice([2, 3, 7])))
+        for cell in (plain, quiet):
+            cell.tick(now_ns)
+        begun += quiet.begun
+        assert plain.shown() == quiet.shown(), f"tick {tick}"
+        told = [cell.driver.bank.take_events() for cell in (plain, quiet)]
+        assert told[0] == told[1], f"tick {tick}"
+        started.update(event.kind for event in told[0])
+        draw, records = rng.random(), np.zeros(8, numpy_dtype(NodeClass.AXIS))
+        for record in records:
+            record["axis"], record["control_mode"] = rng.integers(3), int(ControlMode.POSITION)
+            record["position"] = rng.choice([rng.uniform(-0.02, 0.02), rng.uniform(0.0, 1e-6)])
+            if rng.random() < 0.1:
+                record["control_mode"] |= int(ControlMode.SPECIFIED_MAX_VEL_ACC)
+                record["max_velocity"], record["max_acceleration"] = rng.uniform(0.1, 0.5), rng.uniform(1.0, 5.0)
+            elif rng.random() < 0.004:
+                record["control_mode"], record["force"] = int(ControlMode.FORCE), 5.0
+            elif rng.random() < 0.01:
+                record["control_mode"], record["velocity"] = int(ControlMode.VELOCITY), rng.uniform(-0.1, 0.1)
+        for cell in (plain, quiet):
+            bank = cell.driver.bank
+            if draw < 0.02:
+                try:
+                    bank.append(records, range(3), now_ns + 300_000, replace=draw < 0.002)
+                except CommandError:
+                    refused += 1
+            elif draw < 0.022:
+                bank.stop([0], now_ns + 200_000)
+            elif draw < 0.023:
+                bank.emergency_stop([1], now_ns + 200_000)
+            elif draw < 0.04:
+                bank.reset([0, 1, 2])
+    assert {EventKind.STARTED, EventKind.ENDED, EventKind.IDLE} <= started
+    assert begun > 40, f"{begun}: most of the commands that follow others"
+
+
 @pytest.mark.parametrize("awaited", [False, True])
 @pytest.mark.parametrize(
     "mode, column, value, gain",
@@ -109,6 +152,13 @@ def test_a_device_that_is_late_plans_ahead_and_goes_on_by_steps(monkeypatch, lat
     if not late:
         clock_ns = now_ns + PERIOD_NS // 2
     assert cell.steps.is_ready(True) == late
+    if not late:  # where the next tick is always as near, each of them would be the loop's
+        world = cell.driver._world
+        world.tick_ns = PERIOD_NS // 5
+        clock_ns = now_ns + world.tick_ns - world.tick_ns // 20
+        assert not cell.steps.is_ready(True)
+        clock_ns = now_ns + world.tick_ns // 2
+        assert cell.steps.is_ready(True)
 
 
 @pytest.mark.parametrize("at_ms", [300, 570], ids=["as steps", "from an edge on in Python"])
