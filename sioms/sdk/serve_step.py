@@ -273,6 +273,13 @@ def counted(d: Desk) -> int:
 
 
 @step
+def note_word(d: Desk, who: int, heard_ns: int, came_ns: int) -> int:
+    """Note when a client said something, as a gateway tells; 0: it does not."""
+    d.heard[who] = max(d.heard[who], min(heard_ns, came_ns))
+    return 0
+
+
+@step
 def serve_packet(d: Desk, who: int, tick: int) -> int:
     """Serve the next packet of a writer; return 0 when all is done, 1 when it, or its answer, is the loop's."""
     if d.kept >= MOST_KEPT:
@@ -288,7 +295,7 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     heard_ns = read_heard(d, begin + size)
     if heard_ns:
         drop_packet(d.fds[who])
-        d.heard[who] = max(d.heard[who], min(heard_ns, came_ns))
+        note_word(d, who, heard_ns, came_ns)
         return 0
     d.at = begin
     heard_ns = read_passed(d, begin + size)
@@ -304,7 +311,7 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     kept = d.kept
     d.effect[kept] = clock_ns()
     sent = send_packet(d.fds[who], d.reply, put_reply(d, tick, d.effect[kept]))
-    d.heard[who] = max(d.heard[who], min(heard_ns, came_ns))
+    note_word(d, who, heard_ns, came_ns)
     d.start[kept] = start
     d.size[kept] = begin + size - start
     d.writer[kept] = who
