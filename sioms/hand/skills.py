@@ -76,8 +76,9 @@ class Skills:
 
         Raises:
             Failed: as the fault says; the hand has opened or is frozen.
+            ValueError: a time below 0, or none.
         """
-        return self._guarded("hold", self._hold_parallel(time_s))
+        return self._guarded("hold", self._hold_parallel(_lasting(time_s)))
 
     def grasp(self) -> Generator[Setpoint, Reading, Sensed]:
         """Close on whatever is between the fingers and feel it.
@@ -108,8 +109,9 @@ class Skills:
 
         Raises:
             Failed: contact lost, cone, end of the array, overload or a stale sensor.
+            ValueError: a time below 0, or none.
         """
-        return self._guarded("hold", self._hold(time_s))
+        return self._guarded("hold", self._hold(_lasting(time_s)))
 
     def release(self) -> Generator[Setpoint, Reading, None]:
         """Open by the clearance."""
@@ -591,6 +593,12 @@ def _mixed(last: tuple[float, float] | None, new: tuple[float, float], share: fl
     if last is None:
         return new
     return last[0] + share * (new[0] - last[0]), last[1] + share * (new[1] - last[1])
+
+
+def _lasting(time_s: float) -> float:
+    if not time_s >= 0.0:
+        raise ValueError(f"hold object: for {time_s:g} s; want 0 s or more")
+    return time_s
 
 
 def _degrees(held: Grasp) -> str:

@@ -73,6 +73,16 @@ class Setpoint:
     frozen: bool = False
 
 
+_MANNERS = {
+    "force_n": (1e-3, 1e3), "light_n": (1e-3, 1e3), "closing": (1e-5, 1.0), "moving": (1e-5, 1.0),
+    "turning": (1e-4, 100.0), "rolling": (1e-4, 100.0), "gain": (1e-3, 1e3), "close_s": (1e-3, 1e5),
+    "roll_s": (1e-3, 1e5), "clearance_m": (1e-4, 0.1), "tolerance_rad": (1e-6, 1.0), "held_rad": (0.0, 1.0),
+    "frames": (1, 100_000), "light_rad": (0.0, math.pi), "squeeze_rad": (0.0, math.pi), "friction": (1e-3, 100.0),
+    "most_n": (1e-3, 1e3), "lost_s": (1e-3, 100.0), "stale_s": (1e-3, 100.0), "regrasps": (0, 1000),
+}  # fmt: skip
+"""Bounds of how a skill may be done."""
+
+
 class State(Enum):
     """Where a skill is."""
 
@@ -194,6 +204,25 @@ class Manner:
     smallest: bool = False
     opening: tuple[float, float] = (2.0 * FINGER_M + 5e-3, 0.2)
     reach: tuple[float, float, float, float] = (-0.4, 0.4, -0.6, 0.6)
+
+    def __post_init__(self) -> None:
+        """Refuse what no hand can do.
+
+        Raises:
+            ValueError: with a sentence.
+        """
+        for name, (least, most) in _MANNERS.items():
+            if not least <= getattr(self, name) <= most:
+                raise ValueError(f"use hand: {name} is {getattr(self, name):g}; want {least:g} to {most:g}")
+        if not self.force_n <= self.most_n:
+            raise ValueError(f"use hand: force_n is {self.force_n:g} N; want at most {self.most_n:g} N, an overload")
+        left, right, bottom, top = self.reach
+        for name, low, high in (
+            ("arc", *self.arc), ("opening", *self.opening), ("reach, along x,", left, right),
+            ("reach, along y,", bottom, top),
+        ):  # fmt: skip
+            if not -math.inf < low < high < math.inf:
+                raise ValueError(f"use hand: {name} is {low:g} to {high:g}; want two finite numbers that rise")
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -135,6 +136,30 @@ def test_an_object_in_which_a_finger_would_be_is_refused() -> None:
 
 def _idle(hand: PlaneHand) -> Setpoint:
     return Setpoint(hand.hand.forward(hand.reading.joints), (0.0,) * 6, 0.0, frozen=True)
+
+
+@pytest.mark.parametrize(("keys", "words"), [
+    ({"force_n": math.nan}, "force_n is nan; want 0.001 to 1000"), ({"force_n": -1.0}, "force_n is -1"),
+    ({"force_n": 5.0}, "force_n is 5 N; want at most 4 N"), ({"frames": 0}, "frames is 0; want 1 to"),
+    ({"closing": 0.0}, "closing is 0"), ({"closing": math.inf}, "closing is inf"),
+    ({"rolling": -0.1}, "rolling is -0.1"), ({"clearance_m": 1.0}, "clearance_m is 1"),
+    ({"regrasps": -1}, "regrasps is -1"), ({"stale_s": math.nan}, "stale_s is nan"),
+    ({"arc": (2.0, 1.0)}, "arc is 2 to 1; want two finite numbers that rise"),
+    ({"opening": (0.0, math.inf)}, "opening is 0 to inf"),
+    ({"reach": (0.4, -0.4, 0.0, 1.0)}, "reach, along x, is 0.4 to -0.4"),
+])  # fmt: skip
+def test_a_manner_that_no_hand_has_is_refused(keys: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=f"^use hand: .*{words}"):
+        Manner(**keys)
+
+
+def test_a_time_that_is_none_is_refused_before_anything_moves() -> None:
+    hand, skills = plane(disk(20 * MM), (0.0, 0.0, 0.0))
+    for time_s in (math.nan, -1.0):
+        for skill in (skills.hold, skills.hold_parallel):
+            with pytest.raises(ValueError, match=r"hold object: for .* s; want 0 s or more"):
+                skill(time_s)
+    assert hand.world.time_s == 0.0
 
 
 def test_nothing_there_is_told() -> None:
