@@ -22,6 +22,7 @@ from sioms.reconcile.effects.smooth import LAWS
 from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
+from sioms.reconcile.halves import on_halves
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import Options, Prepared, noise_read, prepare, reread, searched
@@ -89,7 +90,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     if found is not s.found:
         s = replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
         burst = bursts(s.ready.problem, found.fit)
-    verdict = conclude(s, o, others, burst)
+    verdict = on_halves(conclude(s, o, others, burst), s)
     # a log whose rows the controller has not made one by one is of an axis that has it nevertheless
     model = replace(verdict.model, controller=nominal.controller, refine=nominal.refine, within={})
     return replace(verdict, model=model)

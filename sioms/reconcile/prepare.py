@@ -18,6 +18,7 @@ from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
+from sioms.reconcile.polled import evened
 from sioms.reconcile.rate import trusted_blindly
 from sioms.reconcile.records import Session
 from sioms.reconcile.refine import bounded
@@ -105,12 +106,16 @@ def prepare(session: Session, nominal: AxisModel, o: Options) -> Prepared:
 
 
 def _prepared(session: Session, nominal: AxisModel, o: Options) -> Prepared:
+    session, polled = evened(session, nominal.sample_time_s)
     session, notes = on_grid(session, nominal.sample_time_s)
+    notes = [*polled, *notes]
     session, left_out = usable(session, searched(session), nominal)
     notes += left_out
     notes += check(session, nominal)
     if session.final:
         check(Session(session.final), nominal)
+    if polled:
+        return _polled(session, nominal, notes, o)
     if session.loop_time_s is not None:
         late = 0.5 * session.loop_time_s / nominal.sample_time_s
         if late < OWN_PACE:
@@ -121,6 +126,21 @@ def _prepared(session: Session, nominal: AxisModel, o: Options) -> Prepared:
         return other
     check_law(searched(session), nominal)
     return ready
+
+
+def _polled(session: Session, nominal: AxisModel, notes: Sequence[str], o: Options) -> Prepared:
+    """Prepare records whose rows were interpolated: their force is known at the instants of the rows, no controller can
+    be followed from one to the next, and what is late or early by a part of a step does not show.
+    """
+    nominal = replace(nominal, controller=None)
+    if session.loop_time_s is not None:
+        sampling = Sampling(0.5 * session.loop_time_s / nominal.sample_time_s)
+    else:
+        plain = _channels(session, nominal, notes, o)
+        sampling = sampling_of(plain.problem, plain.model) or Sampling(0.0)
+    sampling = Sampling(0.0) if sampling.late is None else sampling
+    ready = _read(session, nominal, [*notes, sampling.text(nominal.sample_time_s)], o, sampling)
+    return replace(ready, names=tuple(n for n in ready.names if n not in TIMES))
 
 
 def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options) -> Prepared | None:

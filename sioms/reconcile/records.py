@@ -68,12 +68,14 @@ class Session:
         final: whole records that take no part in any choice, each of a session of its own; without them the
             last part of every record is kept for the final statement.
         loop_time_s: period of the loop that makes the force; None where nobody said (``sampling``).
+        halves: of polled records, which are interpolated, the same from every other row, and from the others.
     """
 
     records: tuple[Record, ...]
     continuous: bool = True
     final: tuple[Record, ...] = ()
     loop_time_s: float | None = None
+    halves: tuple[Session, ...] = ()
 
     @property
     def samples(self) -> int:

@@ -88,7 +88,9 @@ def read_as(session: Session, sampling: Sampling) -> Session:
             external=mean(r.external, None if late is None else 0.0),
         )
 
-    return replace(session, records=tuple(map(read, session.records)), final=tuple(map(read, session.final)))
+    halves = tuple(read_as(half, sampling) for half in session.halves)
+    records, final = tuple(map(read, session.records)), tuple(map(read, session.final))
+    return replace(session, records=records, final=final, halves=halves)
 
 
 def _mean(signal: Array, late: float | None) -> Array:

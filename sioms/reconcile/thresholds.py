@@ -74,6 +74,16 @@ OTHER_RATE, LAW_TELLS, LAW_LEAST = 1.1, 3.0, 1e-3
 than the last share of it, at a sample time that is the first times the stated one. Forty axes, whose laws hardly hold
 it: 1.1 at most; a law with a derivative 50 and more (0661)."""
 
+JITTERS, STAMPED = 0.02, 0.7
+"""Rows come at no fixed rate where their steps vary by the first share, and were read at their stamps where the
+position is rougher by the second on an even grid. Chosen: stamps that are late notes of even samples make it rougher at
+the stamps (1042)."""
+RESOLVES, FORETELLS = 0.02, 0.5
+"""Rows resolve motion and force where the cubic through the four neighbours of each foretells it to within this share
+of its spread: of a sine, some ten rows a period. What they resolve is proved afterwards, on every other row (1042)."""
+STANDS = 0.5
+"""A number that is found on every other row of a polled log differs by less than this share of it (1042)."""
+
 # --- when an effect counts
 
 GAIN = 0.05
