@@ -6,6 +6,7 @@ from quiet_rig import PERIOD_NS, Cell
 
 from sioms.motion import CommandError, EventKind
 from sioms.motion.axis_step import SETTLING
+from sioms.motion.plan_step import may_follow
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import numpy_dtype
 from sioms.sdk.driver import TickDriver
@@ -71,7 +72,7 @@ def test_commands_that_wait_begin_by_steps_as_by_the_driver(monkeypatch, seed):
         draw, records = rng.random(), np.zeros(8, numpy_dtype(NodeClass.AXIS))
         for record in records:
             record["axis"], record["control_mode"] = rng.integers(3), int(ControlMode.POSITION)
-            record["position"] = rng.choice([rng.uniform(-0.02, 0.02), rng.uniform(0.0, 1e-6)])
+            record["position"] = rng.choice([rng.uniform(-0.02, 0.02), rng.uniform(0.0, 1e-8)])
             if rng.random() < 0.1:
                 record["control_mode"] |= int(ControlMode.SPECIFIED_MAX_VEL_ACC)
                 record["max_velocity"], record["max_acceleration"] = rng.uniform(0.1, 0.5), rng.uniform(1.0, 5.0)
@@ -94,6 +95,21 @@ def test_commands_that_wait_begin_by_steps_as_by_the_driver(monkeypatch, seed):
                 bank.reset([0, 1, 2])
     assert {EventKind.STARTED, EventKind.ENDED, EventKind.IDLE} <= started
     assert begun > 40, f"{begun}: most of the commands that follow others"
+
+
+@pytest.mark.parametrize("way", [1e-8, 0.01])
+def test_what_follows_a_short_command_is_the_banks_which_counts_its_pace(way):
+    cell, now_ns = Cell(True), 1_000_000_000
+    cell.tick(now_ns)
+    bank = cell.driver.bank
+    records = np.zeros(2, numpy_dtype(NodeClass.AXIS))
+    records["control_mode"] = int(ControlMode.POSITION)
+    records["position"] = float(bank.plans.final[0, 0]) + way, 0.1
+    bank.append(records, range(3), now_ns)
+    bank._settle(now_ns)
+    bank.plan_ahead()
+    assert bank.is_quiet() and bank.plans.follows and bank.plans.ready[0]
+    assert bool(may_follow(bank.plans, 0, now_ns + PERIOD_NS)) == (way > 1e-6)
 
 
 @pytest.mark.parametrize("awaited", [False, True])
