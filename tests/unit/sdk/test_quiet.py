@@ -104,7 +104,7 @@ def test_what_follows_a_short_command_is_the_banks_which_counts_its_pace(way):
     bank = cell.driver.bank
     records = np.zeros(2, numpy_dtype(NodeClass.AXIS))
     records["control_mode"] = int(ControlMode.POSITION)
-    records["position"] = float(bank.plans.final[0, 0]) + way, 0.1
+    records["position"] = float(bank._sequencer.store.final[0, 0]) + way, 0.1
     bank.append(records, range(3), now_ns)
     bank._settle(now_ns)
     bank.plan_ahead()
