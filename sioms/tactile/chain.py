@@ -20,6 +20,10 @@ an element that moves alone is suspect and left out, until it has stood still fo
 then it gets a baseline of its own again. So does an element that comes to life late. What moves all elements alike, a
 step of the supply, is taken into the baseline at once.
 
+A contact that grows so slowly that the baseline follows it is found by the change since the last zero
+(`sioms.tactile.slow`): the baseline then goes back to where drift alone would have led it. Likewise a touch that has
+been let go ends where what is left of it is drift.
+
 Readings that repeat may be those of a converter with steps above its noise: they count as they are, with the step as
 their uncertainty, for as long as a touch is held. But where most elements have been seen to be noisy since the last
 `zero`, an element that repeats its reading for `DEAD_FRAMES` is dead; if all do, the converter is stuck, and the finger
@@ -38,6 +42,7 @@ from sioms.tactile.finger import LARGEST, LEAST, Finger
 from sioms.tactile.linearity import linearise
 from sioms.tactile.model import StrainTable
 from sioms.tactile.rest import Rebase, Rest
+from sioms.tactile.slow import EVERY_S, SURE, Change, SlowWatch
 from sioms.tactile.witness import FEWEST, TOUCH_SIGMA, Sight, Witness, moves_alone
 
 Floats = NDArray[np.float64]
@@ -59,6 +64,11 @@ _CREPT, _CREPT_AFTER_HOLD = (
     0.1,
     0.02,
 )  # of the output of a touch, that may be left at once and after the release hold
+_RELEASED = 8  # frames below the level that ends a touch, for one that was found slowly
+_LEFT = 0.1  # of the strength of a touch, that drift during the touch may leave
+_LEFT_S = 1.0  # for so long
+_LESS = 0.8  # of the limit of hidden loads, below which a finger that had drifted is no longer blind
+_UNLIKE = 5.0  # deviations of what drift leaves, below which nothing is like a contact
 _DRIFT_SHARE = 0.2  # of the noise, by which the baseline may move unseen in one drift time
 
 
@@ -87,6 +97,8 @@ class StrainFrame:
         variance: of the strains, shape (ns,), where the converter's steps or noise are above those of the finger's
             file.
         held: the mean over a touch that has been steady; the same object until there is a longer one.
+        slow: the touch was found by the change since the last zero, and may be drift.
+        drifted: `blind` for contacts that grow slowly: uneven drift since the last zero would hide them.
     """
 
     strains: Floats
@@ -99,6 +111,8 @@ class StrainFrame:
     blind: bool = False
     variance: Floats | None = None
     held: Held | None = None
+    slow: bool = False
+    drifted: bool = False
 
 
 class SignalChain:
@@ -120,7 +134,8 @@ class SignalChain:
         self._fading = math.log(_CREPT / _CREPT_AFTER_HOLD) / max(self._signal.release_hold_s, 1e-3)
         self._mixing: Floats | None = None  # the gains as a matrix, if they are more than a diagonal
         self._own_noise = np.array(e.noise) ** 2
-        self._witness = Witness(finger, finger.strain_table() if table is None else table)
+        table = finger.strain_table() if table is None else table
+        self._witness, self._watch_slow = Witness(finger, table), SlowWatch(finger, table)
         self._changes = np.zeros(self._count)
         self._frames, self._is_noisy, self._step = 0, False, math.inf
         self._settle = settle_frames
@@ -168,6 +183,11 @@ class SignalChain:
         self._suspect: Flags = np.zeros(self._count, dtype=np.bool_)
         self._still_s, self._stood, self._mark = (np.zeros(self._count) for _ in range(3))
         self._average = _Average(self._count)
+        self._watch_slow.zero(baseline)
+        self._is_slow, self._is_sure, self._drifted = False, False, False
+        self._uneven: Floats = np.zeros(self._count)
+        self._smooth: Floats = np.zeros(self._count)
+        self._below, self._peak, self._unlike_s = 0, 0.0, 0.0
         self._weigh()
 
     def _weigh(self) -> None:
@@ -242,6 +262,8 @@ class SignalChain:
             usable, strength = self._judge(change, usable, sight)
             self._follow(change, usable, elapsed_s)
             self._recover(output, alive, elapsed_s)
+            if self._watch_slow.take(output, alive, elapsed_s):
+                change = self._look_slowly(output, change, usable)
         told = self._told(change, usable, saturated, dead, strength, sight.blind)
         if self._rebasing is not None:
             self._rebase(self._rebasing, output, alive, stamp_ns, sight.blind)
@@ -299,6 +321,45 @@ class SignalChain:
             self._variance[back] = 1.0 / self._stood[back]
             self._crept[back] = 0.0
             self._suspect &= ~back
+            self._watch_slow.adopt(back, self._mark, self._smooth)
+
+    def _look_slowly(self, output: Floats, change: Floats, usable: Flags) -> Floats:
+        """Look for a contact in the change since the last zero; return the change of the outputs."""
+        found = self._watch_slow.look(usable, self._noise)
+        if found is None:
+            return change
+        if self._touched:
+            self._is_sure = self._is_sure or (found.contact and found.size > SURE)
+            self._end_slowly(found, usable)
+        elif found.contact:
+            self._baseline = np.where(usable, self._watch_slow.reference(found), self._baseline)
+            self._touched = self._is_slow = True
+            self._is_sure, self._drifted = found.size > SURE, False
+            self._below, self._peak, self._unlike_s = 0, 0.0, 0.0
+            self._uneven, self._smooth = found.uneven, found.smooth
+            return output - self._baseline
+        else:
+            limit = found.limit_n_per_m * (_LESS if self._drifted else 1.0)
+            self._drifted, self._smooth = found.hidden_n_per_m > limit, found.smooth
+            if found.pull:
+                self._watch_slow.lower(found)
+        return change
+
+    def _end_slowly(self, found: Change, usable: Flags) -> None:
+        """End a touch of which nothing is left but drift."""
+        mean = self._watch_slow.mean(usable)
+        square = self._squares(mean - self._baseline, usable)[0]
+        strength = float(square.sum()) / np.count_nonzero(usable)
+        self._peak = max(self._peak, strength)
+        is_drift = not found.contact and found.hidden_n_per_m <= found.limit_n_per_m and found.size < _UNLIKE
+        if not (is_drift and (self._is_slow or strength < _LEFT * self._peak)):
+            self._unlike_s = 0.0
+            return
+        self._unlike_s += EVERY_S
+        if self._unlike_s >= _LEFT_S:
+            self._baseline = np.where(usable, mean, self._baseline)
+            self._variance[usable] = 1.0
+            self._release()
 
     def _told(
         self, change: Floats, usable: Flags, saturated: Flags, dead: Flags, strength: float, blind: bool
@@ -308,14 +369,20 @@ class SignalChain:
         strains[~usable] = np.nan
         variance = None if self._is_own else self._gain**2 * self._noise
         held = None
-        if self._touched and not blind:
+        if self._is_slow:
+            variance = self._gain**2 * (self._noise + self._uneven**2)
+        if self._touched and not (blind or self._is_slow):
             before = self._average.held
             held = self._average.take(strains, usable, self._gain**2 * self._noise, self._variance, not self._is_own)
             if held is not None and held is not before:
                 self._look_longer(held, usable)
         else:
             self._average.clear()
-        return StrainFrame(strains, usable, saturated, dead, self._touched, True, strength, blind, variance, held)
+        drifted = self._drifted and not (self._touched or blind)
+        return StrainFrame(
+            strains, usable, saturated, dead, self._touched, True, strength, blind or drifted, variance, held,
+            self._is_slow and not self._is_sure, drifted,
+        )  # fmt: skip
 
     def _look_longer(self, held: Held, usable: Flags) -> None:
         """Find whether one element has moved alone, in the mean over a steady touch: its noise is that much less."""
@@ -433,9 +500,20 @@ class SignalChain:
     def _touch(self, strength: float, count: int) -> None:
         level = 1.0 + TOUCH_SIGMA * math.sqrt(2.0 / count)
         if strength > level:
-            self._touched = True
-        elif strength < 0.5 * (1.0 + level):
-            self._touched = False
+            if not self._touched:
+                self._touched, self._peak, self._unlike_s = True, 0.0, 0.0
+            self._below = 0
+        elif strength >= 0.5 * (1.0 + level):
+            self._below = 0
+        elif self._touched:
+            self._below += 1
+            if not self._is_slow or self._below >= _RELEASED:
+                self._release()
+
+    def _release(self) -> None:
+        """End the touch."""
+        self._touched = self._is_slow = self._is_sure = False
+        self._watch_slow.restart()
 
     def _follow(self, change: Floats, usable: Flags, elapsed_s: float) -> None:
         self._crept *= math.exp(-elapsed_s * self._fading)

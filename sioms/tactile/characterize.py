@@ -17,6 +17,8 @@ from sioms.tactile.touches import BASELINE, LOADED, Recording
 
 Floats = NDArray[np.float64]
 
+_SLOPE_SIGMA = 20.0  # of an element's slope, for its share to be better known than that all are alike
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
@@ -80,6 +82,14 @@ def thermal_of(recording: Recording) -> Thermal | None:
     slope = warm @ raw / square
     rest = raw - warm[:, None] * slope
     return Thermal(slope, np.sqrt((rest**2).sum(0) / max(warm.size - 2, 1) / square))
+
+
+def shares_of(thermal: Thermal) -> tuple[float, ...]:
+    """Return each element's slope over their median; nothing where the slopes are not known well enough to help."""
+    middle = float(np.median(thermal.slope))
+    if not np.isfinite(thermal.slope).all() or abs(middle) < _SLOPE_SIGMA * float(np.max(thermal.deviation)):
+        return ()
+    return tuple(round(float(share), 5) for share in thermal.slope / middle)
 
 
 @dataclass(frozen=True, slots=True)

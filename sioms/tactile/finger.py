@@ -90,6 +90,8 @@ class Signal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         release_hold_s: how long after a touch the baseline rests, for creep to fade.
         proximity: output that a conducting indenter draws without strain, at its own place.
         proximity_range_rad: angle over which that falls to 1/e.
+        thermal: what temperature does to each element's output, over what it does to their median; empty: to all
+            alike.
     """
 
     scale: float = 0.01
@@ -99,6 +101,7 @@ class Signal(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     release_hold_s: float = 1.0
     proximity: float = 0.0
     proximity_range_rad: float = 0.25
+    thermal: tuple[float, ...] = ()
 
 
 class ContactModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -218,6 +221,8 @@ class Finger(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
                 )
             if not gain >= LEAST:
                 raise ValueError(f"{what}: element {place} has gain {gain}; need > 0")
+        if len(self.signal.thermal) not in (0, count):
+            raise ValueError(f"{what}: {len(self.signal.thermal)} values of thermal for {count} elements")
         if len({round(angle, 6) for angle in self.elements.angle_rad}) < count:
             raise ValueError(f"{what}: two elements have one angle_rad; need places that differ")
 

@@ -26,13 +26,15 @@ class Quality(Flag):
     WITHOUT_LOAD = auto()  # the force sensor's load was not there, too old, or did not press: fitted without it
     BLIND = auto()  # whether anything touches is not known: the elements that are left cannot say
     SUSPECT = auto()  # one touch explains the strains only without one element, or without a shift of all: fitted so
+    SLOW = auto()  # found by the change since the last zero alone: grown as slowly as drift does, and may be drift
+    DRIFTED = auto()  # uneven drift since the last zero would hide a contact that grows slowly: zero it
 
 
 _UNKNOWN = Quality.TOO_FEW_ELEMENTS | Quality.NO_BASELINE | Quality.BLIND
 _NOTHING = Quality.NO_CONTACT | Quality.WRONG_SIGN | _UNKNOWN
 _DOUBT = (
     Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
-    | Quality.SUSPECT | Quality.WRONG_SIGN
+    | Quality.SUSPECT | Quality.WRONG_SIGN | Quality.SLOW
 )  # fmt: skip
 
 

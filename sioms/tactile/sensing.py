@@ -173,7 +173,7 @@ class ShapeSensor:
         """
         quality = self._last.quality
         state = state_of(quality)
-        if state is State.BLIND and Quality.NO_BASELINE not in quality:
+        if state is State.BLIND and not quality & (Quality.NO_BASELINE | Quality.DRIFTED):
             raise ValueError(
                 "it is blind: its elements cannot tell whether anything touches; see to them and their converter"
             )
@@ -238,7 +238,7 @@ class ShapeSensor:
         bad = Quality.GOOD if strain.usable.all() else Quality.BAD_ELEMENTS
         if strain.blind:
             few = Quality.TOO_FEW_ELEMENTS if np.count_nonzero(strain.usable) < FEWEST else Quality.GOOD
-            return nothing(Quality.BLIND | bad | few)
+            return nothing(Quality.BLIND | bad | few | (Quality.DRIFTED if strain.drifted else Quality.GOOD))
         if not strain.touched:
             return nothing(Quality.NO_CONTACT | bad)
         shape = self._estimator.frame(strain.strains, load, strain.usable, strain.variance)
@@ -248,7 +248,7 @@ class ShapeSensor:
         if strain.held is not self._held:
             self._verdict = self._judged(strain, shape.load_n_per_m)
             self._held = strain.held
-        more = self._verdict
+        more = self._verdict | (Quality.SLOW if strain.slow else Quality.GOOD)
         if self._tare is not None and load is None:
             more |= Quality.WITHOUT_LOAD
         return dataclasses.replace(shape, quality=shape.quality | more) if more else shape

@@ -18,7 +18,7 @@ from sioms.report_page import Page
 from sioms.tactile.calibrate import NEAR, strain_of
 from sioms.tactile.calibration import Calibration, Options
 from sioms.tactile.calibration import calibrate as fit
-from sioms.tactile.characterize import creep_of, noise_of, proximity_of, relaxation_of, thermal_of
+from sioms.tactile.characterize import creep_of, noise_of, proximity_of, relaxation_of, shares_of, thermal_of
 from sioms.tactile.closedform import equivalent_radius, indenter_radius
 from sioms.tactile.command.pictures import poisson_responses
 from sioms.tactile.command.progress import Progress
@@ -44,7 +44,7 @@ def calibrate(args: argparse.Namespace) -> int:
     ramps = [] if ramp is None else ramps_of(ramp, data.nominal.signal.scale)
     result = fit(data.nominal, join(list(data.touches.values())), options, progress, ramps)
     report = args.report or args.output.with_suffix(".html")
-    finger = result.finger
+    finger = _warmed(result.finger, data.recordings.get("thermal"))
     if result.doubts:
         if not args.doubtful:
             write_report(data, result, report, progress)
@@ -62,6 +62,16 @@ def calibrate(args: argparse.Namespace) -> int:
         print(f"warning: {warning}")
     print(f"wrote {args.output} ({result.finger.contact.model}, map: {result.finger.notes['map']}) and {report}")
     return 0
+
+
+def _warmed(finger: Finger, recording: Recording | None) -> Finger:
+    """Return the finger with what temperature does to each of its elements, if that was recorded."""
+    thermal = None if recording is None else thermal_of(recording)
+    if thermal is None:
+        return finger
+    return msgspec.structs.replace(
+        finger, signal=msgspec.structs.replace(finger.signal, thermal=shares_of(thermal))
+    )  # fmt: skip
 
 
 def write_report(data: Data, result: Calibration, path: Path, progress: Callable[[str], None]) -> None:

@@ -93,6 +93,7 @@ def test_calibrate_writes_a_finger_and_a_report(folder: Path, capsys: pytest.Cap
     finger = from_toml(out.read_text())
     # the touches were line loads and an edge of 45 degrees is a little wider: the fit goes a little less deep
     assert np.array(finger.elements.gain) == pytest.approx(np.full(16, 3.0), rel=0.15)
+    assert finger.signal.thermal == pytest.approx((1.0,) * 16, abs=0.02)
     Estimator(finger)
     page = out.with_suffix(".html").read_text()
     assert page.count("data:image/png;base64,") >= 5
