@@ -140,7 +140,13 @@ def _polled(session: Session, nominal: AxisModel, notes: Sequence[str], o: Optio
         sampling = sampling_of(plain.problem, plain.model) or Sampling(0.0)
     sampling = Sampling(0.0) if sampling.late is None else sampling
     ready = _read(session, nominal, [*notes, sampling.text(nominal.sample_time_s)], o, sampling)
-    return replace(ready, names=tuple(n for n in ready.names if n not in TIMES))
+    return replace(ready, names=tuple(n for n in ready.names if n not in TIMES and not _between_rows(n)))
+
+
+def _between_rows(name: str) -> bool:
+    """Say whether an effect is over before the next row: a gap that is passed, friction that builds up."""
+    mechanism = library()[name].mechanism
+    return mechanism.bounces or mechanism.builds_up
 
 
 def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options) -> Prepared | None:
