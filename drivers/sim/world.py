@@ -70,8 +70,8 @@ _JOINTS = tuple(
     for joint in ("x", "y", "th")
 )
 _STEADY = 2.5
-"""An object of this many times step_s^2 and the stiffness of all rubber gains 3 % of its energy at most, thrown at 2 m/s
-between two fingers; one of two fifths of it 40 %."""
+"""An object of this many times step_s^2 and the stiffness of all rubber gains at most 3 % of its energy when thrown at
+2 m/s between two fingers; one of two fifths of it 40 %."""
 _MOST_STEPS = 1000
 _FAR_M, _TURNED_RAD = 10.0, 100.0
 _KEYS = {
