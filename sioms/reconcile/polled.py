@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import fields, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
@@ -18,7 +18,7 @@ from scipy.interpolate import CubicSpline, PchipInterpolator
 from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.thresholds import FORETELLS, JITTERS, RESOLVES, STAMPED
+from sioms.reconcile.thresholds import FORETELLS, JITTERS, NEITHER, RESOLVES, STAMPED
 from sioms.reconcile.timing import LEAST_SAMPLES, LONGEST, places
 
 #: Fewest rows of a log, and of a part of one; a step of more than so many usual ones is a gap.
@@ -42,7 +42,15 @@ def evened(session: Session, sample_time_s: float) -> tuple[Session, list[str]]:
         BadInputError: the rows do not resolve the motion or the force.
     """
     every = (*session.records, *session.final)
-    if not any(_is_polled(r, sample_time_s) for r in every):
+    rough = [_rough(r, sample_time_s) for r in every]
+    if not any(r is not None and r.is_polled for r in rough):
+        for record, found in zip(every, rough, strict=True):
+            if found is not None and found.is_neither:
+                raise BadInputError(
+                    f"read record {record.name}: its steps vary, and its rows are true neither at their times nor at "
+                    "even steps, as of a device that is read between its own updates; log what the device samples, or "
+                    "read it at least twice per update"
+                )
         return session, []
     notes: list[str] = []
     parts = [_parts(r, sample_time_s, notes) for r in session.records]
@@ -59,21 +67,46 @@ def evened(session: Session, sample_time_s: float) -> tuple[Session, list[str]]:
     return replace(whole, halves=tuple(halves)), notes
 
 
-def _is_polled(r: Record, dt: float) -> bool:
-    """Say whether the position is the smoother at its stamps, which are uneven, than on the grid of the samples."""
+class _Rough(NamedTuple):
+    """How rough the position of a record of varying steps is.
+
+    Attributes:
+        stamped, even: at its stamps, and on the grid of the samples [{x}].
+        blurred: what its speed makes of the spread of its steps [{x}].
+    """
+
+    stamped: float
+    even: float
+    blurred: float
+
+    @property
+    def is_polled(self) -> bool:
+        """Whether the position is the smoother at its stamps."""
+        return self.stamped < STAMPED * self.even
+
+    @property
+    def is_neither(self) -> bool:
+        """Whether neither the stamps nor the grid are when rows were read, and not noise but that makes it rough."""
+        return STAMPED * self.even <= self.stamped < self.even / STAMPED and self.stamped < NEITHER * self.blurred
+
+
+def _rough(r: Record, dt: float) -> _Rough | None:
+    """Return how rough the position is; None where the steps do not vary."""
     if r.time_s is None or len(r.time_s) != len(r) or len(r) < FEWEST:
-        return False
+        return None
     rows = _fresh(r)
     t, x = _times(rows), rows.position
     if len(rows) < FEWEST or not np.all(np.isfinite(t)) or np.any(np.diff(t) <= 0.0) or not np.all(np.isfinite(x)):
-        return False
+        return None
     steps = np.diff(t)
     typical = float(np.median(steps))
     if not STEPS[0] < dt / typical < STEPS[1] or float(np.std(steps)) < JITTERS * typical:
-        return False
+        return None
     place = places(t, dt)
     grid = np.arange(len(t)) if place is None or np.any(np.diff(place) <= 0) else place
-    return _size(foretold(t, x)) < STAMPED * _size(foretold(grid.astype(np.float64), x))
+    speed = _size(np.diff(x)) / typical
+    spread = float(np.std(steps[steps < 2.0 * typical]))  # without gaps, and rows that were lost
+    return _Rough(_size(foretold(t, x)), _size(foretold(grid.astype(np.float64), x)), speed * spread)
 
 
 def _times(r: Record) -> Array:

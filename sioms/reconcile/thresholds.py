@@ -78,6 +78,10 @@ JITTERS, STAMPED = 0.02, 0.7
 """Rows come at no fixed rate where their steps vary by the first share, and were read at their stamps where the
 position is rougher by the second on an even grid. Chosen: stamps that are late notes of even samples make it rougher at
 the stamps (1042)."""
+NEITHER = 2.0
+"""Rows were read neither at their stamps nor evenly where both leave the position about as rough (``STAMPED``), by less
+than this multiple of what the speed makes of the spread of the steps: more is noise. A device with news every 5 ms that
+is polled every 10: 0.9; chosen (1042)."""
 RESOLVES, FORETELLS = 0.02, 0.5
 """Rows resolve motion and force where the cubic through the four neighbours of each foretells it to within this share
 of its spread: of a sine, some ten rows a period. What they resolve is proved afterwards, on every other row (1042)."""

@@ -33,7 +33,7 @@ CERTAIN = 4.5
 its rows under several loads have their errors in common."""
 POSSIBLE = 0.5  # times its natural size that an effect may have before it is said that it is not excluded
 UNTOLD = 1e-6  # times its noise by which a row must change to tell of an effect
-ALIKE = 0.7  # cosine of what two effects change, from which on they are tried together
+UNDOES = 0.7  # cosine of what two effects change, from which on they are tried together
 SLIGHT = 1.0  # times the stated noise of one row by which an effect must change at least one
 
 
@@ -170,7 +170,7 @@ def cancelling(
                 columns[name] = column / np.linalg.norm(column)
     shown, wide = dict[str, SensorModel](), list[str]()
     for one, other in combinations(columns, 2):
-        if abs(columns[one] @ columns[other]) < ALIKE:
+        if abs(columns[one] @ columns[other]) < UNDOES:
             continue
         start = good.model.with_effect(one, good.model.plain(one))
         both = refit(data, start.with_effect(other, start.plain(other)), weights, (), PATIENCE)

@@ -66,6 +66,24 @@ def test_late_stamps_of_even_samples_are_left_as_they_are() -> None:
         assert session.records == (r,) and not session.halves and not notes
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_a_device_that_is_read_between_its_updates_is_refused(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(STEP_S * rng.uniform(0.6, 1.4, 1200))
+    news = 0.005 * np.floor(t / 0.005 + rng.uniform())
+    with pytest.raises(BadInputError, match="true neither at their times nor at even steps"):
+        evened(Session((Record("log", place(news), force(news), time_s=t),)), STEP_S)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_late_stamps_beside_a_coarse_encoder_are_left_as_they_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    t = STEP_S * np.arange(1200)
+    seen = np.round(place(t) / 5e-3) * 5e-3
+    late = Record("log", seen, force(t), time_s=t + STEP_S * rng.uniform(0.0, 0.45, len(t)))
+    assert not evened(Session((late,)), STEP_S)[0].halves
+
+
 def test_lost_samples_of_an_even_log_are_not_a_poll() -> None:
     t = STEP_S * np.delete(np.arange(1200), np.random.default_rng(4).integers(0, 1200, 60))
     assert not evened(Session((Record("log", place(t), force(t), time_s=t),)), STEP_S)[0].halves
