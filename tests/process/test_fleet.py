@@ -123,7 +123,7 @@ def test_markers_pass_from_cell_to_cell(fleet: sioms.Fleet) -> None:
 
 
 def _first_motions(nodes: list[Any], begin: list[float]) -> list[int | None]:
-    """Return the times of the first snapshots that show motion; None where that before it is not known.
+    """Return the times of the first snapshots that show motion; None where one more than 15 ms before it is not known.
 
     A page keeps a quarter of a second, and that of a slow link has gaps: the oldest there need not be the first.
     """
@@ -139,7 +139,7 @@ def _first_motions(nodes: list[Any], begin: list[float]) -> list[int | None]:
     for known, start in zip(seen, begin, strict=True):
         moved = [abs(each.commanded_position[0] - start) > 1e-6 for each in known]
         first = moved.index(True)
-        is_known = first and known[first - 1].number + 1 == known[first].number
+        is_known = first and known[first].stamp_ns - known[first - 1].stamp_ns < 15_000_000
         firsts.append(known[first].stamp_ns if is_known else None)
     return firsts
 
@@ -168,7 +168,7 @@ def test_cells_start_at_one_instant_or_not_at_all(fleet: sioms.Fleet) -> None:
             firsts = _first_motions(nodes, begin)
         known = [first for first in firsts if first is not None]
         assert len(known) == len(nodes), "which snapshots showed it first"
-        assert max(known) - min(known) < 30_000_000, "the same tick, as far as two machines' clocks are known"
+        assert max(known) - min(known) < 45_000_000, "the same tick, as far as two machines' clocks are known"
     finally:
         for node in nodes:
             node.close()
