@@ -241,16 +241,14 @@ class ControlLaw:
         """Have servos that leave force mode at rest go on with their force, which may carry something; return how far
         beside the axes their set-points are then (m,).
 
-        Others, and those that would need it farther away than an axis may be behind, hold with none. So do those that
-        have not been at rest for a while: nothing need bear a force that has just begun.
+        Others hold with none. So do those that have not been at rest for a while: nothing need bear a force that has
+        just begun.
         """
         lead = np.zeros(len(axes))
         bears = self.loop.seen_ns - self.moved_ns[axes] > REST_NS
         rests = np.flatnonzero(bears & ~self.moves(axes) & ~self.stepper[axes] & ~self.limp[axes])
         chosen = axes[rests]
         lead[rests] = self._go_on(chosen, self.output[chosen], self._velocity[chosen])
-        far = np.abs(lead) > self._error_max[axes]
-        lead[far] = self._error[axes[far]] = 0.0
         return lead
 
     def drive(self, desired: Vector) -> Vector:
@@ -268,12 +266,16 @@ class ControlLaw:
         return self._go_on(axes, offset + part * (self.output[axes] - offset), self._velocity[axes])
 
     def _go_on(self, axes: NDArray[np.int64], output: Vector, velocity: Vector) -> Vector:
-        """Have servos go on with an output at their velocities; return how far beside them set-points are then (m,)."""
+        """Have servos go on with an output at their velocities; return how far beside them set-points are then (m,).
+
+        Those that would need it farther away than an axis may be behind hold with none.
+        """
         gain = self.k[axes] * (1.0 + self.kz[axes])
         wish = output * (1.0 + self.kp[axes]) - self.offset[axes] - self.kb[axes] * velocity
         carries = self._carries(axes)
         self._integral[axes[carries]] = wish[carries]
         lead: Vector = np.divide(wish, gain, out=np.zeros(len(axes)), where=(gain > 0.0) & ~carries)
+        lead[np.abs(lead) > self._error_max[axes]] = 0.0
         self._error[axes] = lead
         return lead
 

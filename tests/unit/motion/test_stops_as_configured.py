@@ -628,3 +628,23 @@ def test_a_force_too_great_to_be_held_by_a_soft_law_is_no_following_error() -> N
     rig.bank.stop(rig.axes, rig.now_ns)
     rig.tick(1000)
     assert not int(rig.field("status")) & AxisStatus.FAULT
+
+
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop", "abandon"))
+def test_a_stop_puts_no_axis_in_fault(stop: str) -> None:
+    """What its gains had put out in that tick, 16 N, would have needed a set-point farther behind than an axis may be:
+    a fault, which let it go.
+    """
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant, k=100.0, kb=-20.0, force_max=30.0, following_error_max=0.1)
+    rig.write(mode=VELOCITY, velocity=0.3)
+    rig.tick(300)
+    rig.write(mode=VELOCITY | GAINS, velocity=0.3, k=100.0, kb=-100.0, replace=True)
+    rig.tick(2)
+    place, speed = plant.position, plant.velocity
+    assert abs(rig.field("force")) > 0.1 * 100.0
+    end_by(rig, stop)
+    rig.tick(2000)
+    assert not int(rig.field("status")) & AxisStatus.FAULT
+    assert abs(plant.velocity) < 1e-3
+    assert abs(plant.position - place) < speed**2 / 10 + 0.2 * abs(speed)
