@@ -226,7 +226,7 @@ class ControlLaw:
         for i in np.flatnonzero(held_back).tolist():
             self.force_ends.hold_back(int(chosen[i]), float(toward[i]), float(allowed[i]))
         self.give_way(chosen)
-        servo = ~self.stepper[chosen] & ~in_force
+        servo = ~self.stepper[chosen] & (moves | ~in_force)
         chosen, velocity, moves = chosen[servo], velocity[servo], moves[servo]
         output, offset = self.output[chosen], self.offset[chosen]
         limit = self.force_limit[chosen]

@@ -631,6 +631,35 @@ def test_a_force_too_great_to_be_held_by_a_soft_law_is_no_following_error() -> N
 
 
 @pytest.mark.parametrize("stop", ("stop", "emergency_stop", "abandon"))
+@pytest.mark.parametrize(("fields", "pull"), [({"kb": -5.0}, 0.0), ({"kb": 10.0}, 2.0), ({"most": 2.0}, -5.0)], ids=str)
+def test_a_force_with_gains_of_a_command_is_stopped_by_its_ramp(
+    fields: dict[str, float], pull: float, stop: str
+) -> None:
+    """The damping that is configured came into force at once: 20 N, and 20 m/s^2, where 1 m/s^2 was configured."""
+    plant = Mass(viscous=0.0)
+    rig = rig_of(plant, acceleration_max=1.0, force_max=50.0, watch=Watch(uncommanded=False))
+    plant.pull = pull
+    if "most" in fields:  # its load drives it back
+        rig.write(mode=FORCE | MAX_FORCE, force=3.0, max_force=fields["most"])
+    else:
+        rig.write(mode=FORCE | GAINS, force=3.0, k=400.0, **fields)
+    while abs(plant.velocity) < 0.4:
+        rig.tick()
+    place, speed = plant.position, plant.velocity
+    end_by(rig, stop)
+    speeds = [speed]
+    for _ in range(2000):
+        rig.tick()
+        speeds.append(plant.velocity)
+    changes = np.diff(speeds) / 1e-3 * np.sign(speed)
+    assert changes.min() > -1.2
+    if stop != "emergency_stop":  # which lets go, and leaves the axis to its load
+        assert np.abs(speeds).max() < abs(speed) * 1.15
+        assert abs(plant.position - place) < speed**2 / 2.0 + 0.1 * abs(speed) + abs(pull) / 400.0 + 0.01
+        assert abs(plant.velocity) < 1e-3
+
+
+@pytest.mark.parametrize("stop", ("stop", "emergency_stop", "abandon"))
 def test_a_stop_puts_no_axis_in_fault(stop: str) -> None:
     """What its gains had put out in that tick, 16 N, would have needed a set-point farther behind than an axis may be:
     a fault, which let it go.
