@@ -136,7 +136,7 @@ class Served:
         self.desk = Desk(
             plain=plain_of(queue), count=1, fds=row(self.theirs.fileno(), count=MOST_WRITERS),
             first=row(1, count=MOST_WRITERS), known=row(len(AXES), count=MOST_WRITERS), axes=row(1, *AXES, count=4),
-            heard=row(count=MOST_WRITERS),
+            heard=row(count=MOST_WRITERS), reset=row(count=MOST_WRITERS),
             request=StopFile(there=1, file=request, word=0, changed=changed_ns(request)), gives_way=0,
             packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, start=row(), size=row(), writer=row(),
             came=row(), effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0,

@@ -62,7 +62,8 @@ class WriteDesk:
 
         self.record = Desk(
             plain=plain, count=0, fds=row(MOST_WRITERS), first=row(MOST_WRITERS), known=row(MOST_WRITERS),
-            axes=row(axes[0].n), heard=row(MOST_WRITERS), request=self.request, gives_way=int(gives_way),
+            axes=row(axes[0].n), heard=row(MOST_WRITERS), reset=row(MOST_WRITERS), request=self.request,
+            gives_way=int(gives_way),
             grace_ns=GRACE_NS if period_ns <= SOON_NS else 0,
             patience_ns=PATIENCE_NS if period_ns <= SOON_NS else 0,
             packets=self._packets, kept=0, start=row(MOST_KEPT), size=row(MOST_KEPT), writer=row(MOST_KEPT),
@@ -88,6 +89,8 @@ class WriteDesk:
         ][:MOST_WRITERS]
         if writers != self._writers:
             self._list(writers)
+        for i, handle in enumerate(writers):
+            record.reset[i] = handle.reset_ns
         record.count = len(writers)
 
     def _list(self, writers: list[Handle]) -> None:

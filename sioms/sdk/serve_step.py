@@ -69,6 +69,7 @@ class Desk(Record):
     ``axes`` from ``first`` on. A write comes behind a ``request`` to stop.
 
     ``heard``: the instant that the newest Heard of each writer tells, never one that has yet to come; 0: none came.
+    ``reset``: when what each has was reset last [ns]; what a gateway says of before that is the loop's.
 
     A tick that comes less than ``grace_ns`` behind the first packet that is kept may come before it; one that comes
     less than ``patience_ns`` behind it, while a client has yet to read an answer.
@@ -86,6 +87,7 @@ class Desk(Record):
     known: Integers
     axes: Integers
     heard: Integers
+    reset: Integers
     request: StopFile
     gives_way: int
     grace_ns: int
@@ -294,6 +296,8 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     d.at = begin
     heard_ns = read_heard(d, begin + size)
     if heard_ns:
+        if heard_ns < d.reset[who]:
+            return 1
         drop_packet(d.fds[who])
         note_word(d, who, heard_ns, came_ns)
         return 0
@@ -301,6 +305,8 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     heard_ns = read_passed(d, begin + size)
     if not heard_ns:
         d.at = begin
+    elif heard_ns < d.reset[who]:
+        return 1
     start = d.at
     if not read_write(d, begin + size):
         return 1

@@ -1,5 +1,6 @@
 """A write that steps have served does what it does when the loop serves it, whatever comes before and after it."""
 
+import errno
 import random
 from types import SimpleNamespace
 
@@ -9,6 +10,7 @@ from own_writes_rig import CLOCK, World, worlds
 from served_writes_rig import packets
 
 from sioms.drivers.sim.axes import SimAxes
+from sioms.protocol.driver_verbs import DriverVerb
 from sioms.protocol.flags import ControlMode, NodeClass, Request
 from sioms.protocol.journal import JournalReader, Note
 from sioms.protocol.messages import HandleVerb
@@ -133,6 +135,35 @@ def test_steps_hand_over_what_a_gateway_says_of_its_client(make):
     client.write(record(), replace=True)
     assert world.served == count + 1 and handle.heard_ns == said_ns + 1, "both in one packet"
     assert events(world)[-1][2][1] == HandleVerb.WRITE, "the journal has what the client sent"
+
+
+@pytest.mark.parametrize("in_one", [True, False])
+def test_the_first_that_a_gateway_passes_on_may_be_older_than_a_reset(make, in_one):
+    """Nothing has told before that the handle is one of a gateway's."""
+    world = make(SimAxes, TABLE, 1)
+    world.by_steps = 1.0
+    client = world.open(0, [0], exclusive=True)
+    said_ns, put, answers = CLOCK.now_ns, client.channel._put, []
+    for verb in (DriverVerb.NODE_STOP, DriverVerb.NODE_RESET):
+        CLOCK.now_ns += 1_000_000
+        world.order(verb, 0, [0], -1, "eva", world.latch.resets, CLOCK(), *[CLOCK()] * (verb == DriverVerb.NODE_RESET))
+    world.runtime.heed()
+    for _ in range(400):
+        world.tick()
+
+    def pass_on(packet):
+        for each in [Passed(said_ns, packet).packed()] if in_one else [Heard(said_ns).packed(), packet]:
+            put(each)
+
+    client.channel._put = pass_on
+    for _ in range(2):
+        client.write(record(), answers.append)
+        for _ in range(4):
+            world.serve(client)
+            world.tick()
+        client.take()
+        said_ns = CLOCK.now_ns
+    assert [getattr(each, "errno", None) for each in answers] == [errno.ECANCELED, None]
 
 
 @pytest.mark.parametrize("why", ["a wait", "writes under way", "parts", "halted", "stopped", "admits", "link", "reads"])
