@@ -368,7 +368,10 @@ class Replay:
             case verbs.Keepalive() | verbs.Heard() | verbs.Part():
                 return
             case verbs.Passed(_, packet):
-                self._handle(peer, *verbs.take(packet, verbs.ON_HANDLE))
+                number, message = verbs.take(packet, verbs.ON_HANDLE)
+                if isinstance(message, verbs.Passed):
+                    raise MalformedMessage("a packet that is passed on twice")
+                self._handle(peer, number, message)
             case verbs.Subscribe(every):
                 peer.node.readers.pop(peer.pipe, None)
                 if every:

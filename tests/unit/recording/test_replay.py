@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,9 +15,11 @@ from recording_rig import NODES, slots, write
 
 import sioms
 from sioms.client.cell_verbs import is_part
+from sioms.protocol import verbs
+from sioms.protocol.messages import decode_reply
 from sioms.recording.live.files import LiveFile
 from sioms.recording.live.recorder import Recorder
-from sioms.recording.live.replay import Replay
+from sioms.recording.live.replay import Peer, Replay
 from sioms.recording.live.taps import PageTap
 from sioms.recording.reader import Recording
 
@@ -110,3 +114,21 @@ def test_what_happened_happens_again_and_can_be_recorded(replayed: str, tmp_path
 def read_events(path: Path) -> list[object]:
     with Recording(path) as recording:
         return [event for event in recording.events() if event.source == "dev"]
+
+
+def test_packets_that_are_passed_on_in_each_other_end_their_connection(monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    served: Any = Replay.__new__(Replay)
+    node: Any = object()
+    peer = Peer(ours, served._handle, verbs.ON_HANDLE, node)
+    dropped: list[Peer] = []
+    monkeypatch.setattr(served, "_drop", dropped.append, raising=False)
+    once = verbs.Passed(5, verbs.CancelOnHandle(3).packed(7)).packed()
+    theirs.send(once)
+    served._receive(peer)
+    assert (decode_reply(theirs.recv(1000))[1], dropped) == (7, [])
+    theirs.send(verbs.Passed(5, once).packed())
+    served._receive(peer)
+    assert dropped == [peer]
+    ours.close()
+    theirs.close()
