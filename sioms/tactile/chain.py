@@ -351,15 +351,14 @@ class SignalChain:
         square = self._squares(mean - self._baseline, usable)[0]
         strength = float(square.sum()) / np.count_nonzero(usable)
         self._peak = max(self._peak, strength)
-        is_drift = not found.contact and found.hidden_n_per_m <= found.limit_n_per_m and found.size < _UNLIKE
-        if not (is_drift and (self._is_slow or strength < _LEFT * self._peak)):
-            self._unlike_s = 0.0
-            return
-        self._unlike_s += EVERY_S
+        # a touch that was told at once is not undone by what drift hides, nor does drift hold it that is no contact
+        is_drift = not found.contact and (found.size < _UNLIKE if self._is_slow else strength < _LEFT * self._peak)
+        self._unlike_s = self._unlike_s + EVERY_S if is_drift else 0.0
         if self._unlike_s >= _LEFT_S:
             self._baseline = np.where(usable, mean, self._baseline)
             self._variance[usable] = 1.0
             self._release()
+            self._drifted = found.hidden_n_per_m > found.limit_n_per_m  # from this frame on
 
     def _told(
         self, change: Floats, usable: Flags, saturated: Flags, dead: Flags, strength: float, blind: bool

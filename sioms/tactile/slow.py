@@ -151,7 +151,9 @@ class SlowWatch:
 
     def take(self, output: Floats, alive: Flags, elapsed_s: float) -> bool:
         """Take a frame; return whether it is time to look."""
-        self._age_s = np.where(alive, self._age_s + elapsed_s, 0.0)
+        # an element that now and then misses a frame is believed all the same
+        age_s = np.where(alive, self._age_s + elapsed_s, self._age_s - elapsed_s)
+        self._age_s = age_s.clip(0.0, max(MEAN_S, elapsed_s))
         share = elapsed_s / np.clip(self._age_s, max(elapsed_s, 1e-9), max(MEAN_S, elapsed_s, 1e-9))
         self._mean += np.where(alive, share, 0.0) * (output - self._mean)
         self._since_s += elapsed_s

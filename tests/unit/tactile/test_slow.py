@@ -119,6 +119,17 @@ def test_a_contact_is_told_without_an_element(missing: list[int]) -> None:
     assert told_at(rig, 79.6, 6e-3, 1.0, under=gone) < 2.0 * TOLD
 
 
+def test_a_contact_is_told_over_an_element_that_misses_frames() -> None:
+    """A third of them, by a loose plug."""
+    rig, peak, load = Rig(4, 20.0), int(np.argmax(np.abs(touch(70.0, 30.0)))), 0.0
+    while load < 45.0:
+        load += 1.0 / rig.rate
+        output = touch(70.0, load)
+        if rig.random.random() < 0.3:
+            output[peak] = np.nan
+        assert rig.frame(output).state in KNOWN or load < 2.0 * TOLD
+
+
 def test_two_contacts_that_grow_together_are_told() -> None:
     rig = Rig(4, 20.0)
     for load in np.arange(0.0, 25.0, 1.0 / rig.rate):
@@ -200,6 +211,21 @@ def test_drift_under_a_held_touch_is_no_touch_when_that_is_let_go() -> None:
     assert {shape.state for shape in held} == {State.TOUCHED}
     assert held[-1].load_n_per_m == pytest.approx(150.0, abs=4.0)
     assert rig.hold(drift, 0.2)[-1].state is State.UNTOUCHED
+
+
+def test_drift_under_a_touch_that_would_hide_contacts_makes_blind_when_that_is_let_go() -> None:
+    """Not a touch for ever, of which no zero is taken."""
+    rig = Rig(14, 10.0)
+    drift = 0.3 * rig.random.normal(size=16)
+    for share in np.linspace(0.0, 1.0, 600):
+        assert rig.frame(touch(70.0, 300.0) + share * drift).state in KNOWN
+    for shape in rig.hold(drift, 5.0):
+        assert shape.state is not State.UNTOUCHED
+    assert all(Quality.DRIFTED in shape.quality for shape in rig.hold(drift, 2.0))
+    asked = rig.sensor.rebase()
+    rig.hold(drift, 5.0)
+    assert asked.done
+    assert {shape.state for shape in rig.hold(drift, 2.0)} == {State.UNTOUCHED}
 
 
 def test_creep_after_a_long_hold_is_no_touch_that_stays() -> None:
