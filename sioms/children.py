@@ -31,13 +31,13 @@ _PR_SET_PDEATHSIG = 1
 _libc = ctypes.CDLL(None)
 
 
-def ends_with_us(how: signal.Signals = signal.SIGKILL) -> Callable[[], None]:
-    """Return the ``preexec_fn`` of a child that gets a signal when the thread that starts it ends, by prctl(2).
+def ends_with_us(*, gently: bool = False) -> Callable[[], None]:
+    """Return the ``preexec_fn`` of a child that is killed when the thread that starts it ends, by prctl(2).
 
     Args:
-        how: the signal; another than SIGKILL is for programs of others, which may have something to put in order.
+        gently: told to end instead (SIGTERM): a program of others, which may have something to put in order.
     """
-    parent = os.getpid()
+    parent, how = os.getpid(), signal.SIGTERM if gently else signal.SIGKILL
 
     def tie() -> None:
         _libc.prctl(_PR_SET_PDEATHSIG, how, 0, 0, 0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -46,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
         child: subprocess.Popen[bytes] | None = None
         if args.words:
             environment = {**os.environ, "SIOMS_SOCKET": replay.path}
-            child = subprocess.Popen(args.words, env=environment, preexec_fn=ends_with_us(signal.SIGTERM))
+            child = subprocess.Popen(args.words, env=environment, preexec_fn=ends_with_us(gently=True))
         else:
             print(f"SIOMS_SOCKET={replay.path}", flush=True)
 
