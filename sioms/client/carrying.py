@@ -27,7 +27,7 @@ from _signal import (  # type: ignore[import-not-found]  # that of ``signal`` ma
 from collections.abc import Callable, Sequence
 from functools import partial
 from select import POLLIN, poll
-from time import monotonic
+from time import monotonic, sleep
 from typing import TYPE_CHECKING, Protocol, Self
 
 if TYPE_CHECKING:
@@ -39,6 +39,8 @@ WHY_MS = 1000
 """How long the session's own thread may take to say why a channel has ended [ms]."""
 END_S = 5.0
 """How long a thread of the program may take to notice the end of the session that it moves frames of [s]."""
+LOOK_S = 1e-3
+"""How often to look whether it has [s]."""
 NOBODY = -1
 """A channel that is none."""
 MAIN = threading.main_thread().ident
@@ -71,6 +73,33 @@ class Bridge(Protocol):
         """Have the session end."""
 
 
+class Lead:
+    """The right to wait for frames, which a signal leaves behind with nobody: it is taken in one step, by a token, and
+    given back by who cannot know whether he had it.
+    """
+
+    def __init__(self) -> None:
+        self._holder: dict[int, object] = {}
+
+    def take(self, token: object) -> bool:
+        """Take it; return whether it is this token's now."""
+        return self._holder.setdefault(0, token) is token
+
+    @property
+    def is_taken(self) -> bool:
+        """Whether it is anybody's."""
+        return 0 in self._holder
+
+    def has(self, token: object) -> bool:
+        """Return whether it is this token's."""
+        return self._holder.get(0) is token
+
+    def leave(self, token: object) -> None:
+        """Give it back, if it is this token's."""
+        if self.has(token):
+            del self._holder[0]
+
+
 class Carrying:
     """The right to move the frames of a session, which its own thread and those of the program share.
 
@@ -84,7 +113,7 @@ class Carrying:
     def __init__(self, bridge: Bridge) -> None:
         self.lock = threading.Lock()
         self.bridge = bridge
-        self.leading = threading.Lock()
+        self.leading = Lead()
         self._pid = os.getpid()
 
     @property
@@ -122,9 +151,13 @@ class Carrying:
 
     def end(self, release: Callable[[], None]) -> None:
         """Let go of the link when no thread of the program moves its frames; none will any more."""
-        if self.leading.acquire(timeout=END_S):  # else a signal has come where it should not: let it leak
-            with self.lock:
-                release()
+        deadline = monotonic() + END_S
+        while not self.leading.take(self):
+            if monotonic() > deadline:
+                return  # a signal has come where it should not: let it leak
+            sleep(LOOK_S)
+        with self.lock:
+            release()
 
 
 class Carrier:
@@ -169,26 +202,34 @@ class Carrier:
             The answer, b"": what there is lies in the socket. One thread at a time waits on a channel.
         """
         if not self._found:
-            if self._carrying.leading.acquire(False):
-                self._lead(monotonic() + timeout_s)
-            else:
-                self._own.poll(1e3 * timeout_s)
+            token, leading = object(), self._carrying.leading
+            try:
+                if leading.take(token):
+                    self._lead(monotonic() + timeout_s)
+                else:
+                    self._own.poll(1e3 * timeout_s)
+            finally:
+                try:
+                    self._let_go(token)
+                finally:  # where a signal has come behind a call of that
+                    self._let_go(token)
         found, self._found = self._found, b""  # kept until here: who is interrupted finds it with the next call
         return found
 
     def _lead(self, deadline: float) -> None:
         carrying = self._carrying
-        try:
-            carrying.bridge.watch(False)
-            while not self._found and (left_s := deadline - monotonic()) > 0:
-                ready = self._both.poll(1e3 * left_s)
-                if self._fd in dict(ready):
-                    return
-                if ready:
-                    carrying.alone(self._serve)
-        finally:
-            carrying.bridge.watch(True)
-            carrying.leading.release()
+        carrying.bridge.watch(False)
+        while not self._found and (left_s := deadline - monotonic()) > 0:
+            ready = self._both.poll(1e3 * left_s)
+            if self._fd in dict(ready):
+                return
+            if ready:
+                carrying.alone(self._serve)
+
+    def _let_go(self, token: object) -> None:
+        if self._carrying.leading.has(token):
+            self._carrying.bridge.watch(True)
+            self._carrying.leading.leave(token)
 
     def _serve(self) -> None:
         self._found = self._carrying.bridge.serve(self._channel)
@@ -207,7 +248,7 @@ class Led:
 
     def __enter__(self) -> Self:
         for fd, carrying in list(self._sessions.items()):
-            if carrying.leading.acquire(False):
+            if carrying.leading.take(self):
                 carrying.bridge.watch(False)
             else:
                 del self._sessions[fd]  # another thread of the program does
@@ -216,7 +257,7 @@ class Led:
     def __exit__(self, *_: object) -> None:
         for carrying in self._sessions.values():
             carrying.bridge.watch(True)
-            carrying.leading.release()
+            carrying.leading.leave(self)
 
     def wait(self, timeout_s: float) -> None:
         """Wait until an answer has arrived on each channel."""

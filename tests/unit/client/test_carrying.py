@@ -7,6 +7,7 @@ import errno
 import os
 import signal
 import socket
+import sys
 import threading
 import time
 from collections import deque
@@ -155,14 +156,14 @@ def test_one_thread_moves_the_frames_of_several_sessions_until_each_is_answered(
     with Led(carriers) as led:
         numbers = [each.channel.send(Call("list", verbs.List())) for each in rigs]
         led.wait(0.01)
-        assert all(each.bridge.carrying.leading.locked() for each in rigs)
+        assert all(each.bridge.carrying.leading.is_taken for each in rigs)
         for each, number in zip(rigs, numbers, strict=True):
             threading.Timer(0.03, each.link.bring, [number]).start()
         led.wait(20.0)
         for each in rigs:
             assert each.channel.take() is not None
     assert threading.get_ident() in [each.link.taken_by[-1] for each in rigs]
-    assert not any(each.bridge.carrying.leading.locked() for each in rigs), "each has its thread again"
+    assert not any(each.bridge.carrying.leading.is_taken for each in rigs), "each has its thread again"
     for each in rigs[1:]:
         each.channel.close()
 
@@ -189,6 +190,34 @@ def test_a_signal_behind_an_answer_that_has_come_loses_no_answer(rig: Rig) -> No
         rig.ask(5.0)
     rig.link.while_taken = lambda: None
     assert rig.channel.wait(number, Call("list", verbs.List(), limit_s=0.2)).value == f"answer {number}"
+
+
+def test_a_signal_behind_any_call_of_a_wait_leaves_the_link_to_the_sessions_thread(rig: Rig) -> None:
+    carrier, leading = rig.channel.carrier, rig.bridge.carrying.leading
+    assert carrier is not None
+    watched: list[bool] = []
+    rig.bridge.watch = watched.append  # type: ignore[method-assign]
+    for place in range(100):
+        left = place
+
+        def tell(frame: Any, event: str, _: object) -> None:
+            nonlocal left
+            if frame.f_code.co_filename.endswith("carrying.py") and event in ("call", "c_return"):
+                left -= 1
+                if left < 0:
+                    sys.setprofile(None)
+                    raise Interrupted
+
+        sys.setprofile(tell)
+        try:
+            carrier.wait(1e-3)
+        except Interrupted:
+            assert not leading.is_taken and watched[-1:] != [False], f"behind call {place}"
+        else:
+            break
+        finally:
+            sys.setprofile(None)
+    assert 10 < place < 99
 
 
 def test_who_moves_frames_has_an_answer_without_a_socket_and_a_last_word_behind_all(rig: Rig) -> None:
