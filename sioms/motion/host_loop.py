@@ -451,7 +451,8 @@ class AxisBank(Bank):
                 place[left] += law.hold_load(axes[left])
                 sequencer.hold(held, place[~goes_on], self._last_ns)
             if moving.size:
-                state = np.stack((self._position[moving], self._velocity[moving]), axis=1)
+                place[goes_on] += law.relieve(moving, np.zeros(moving.size))  # its damping shall not come at once
+                state = np.stack((place[goes_on], self._velocity[moving]), axis=1)
                 sequencer.brake(moving, state, self._last_ns, sequencer.hardest(moving))
             self._desired[axes], self._desired_velocity[axes] = place, np.where(goes_on, self._velocity[axes], 0.0)
         turned, part = law.force_ends.turned(

@@ -256,8 +256,9 @@ class Sequencer:
         the actual one of axes that cannot follow them, or do so by gains or with a force that a command has set.
         """
         law = self._law
-        state, behind, pressing = self.state(axes, seen_ns), law.is_behind(axes), self.kind[axes] == FORCE
         most, tuned = self._limits.acceleration[axes], law.tuned[axes]
+        state, pressing = self.state(axes, seen_ns), self.kind[axes] == FORCE
+        behind = law.is_behind(axes) & (law.stepper[axes] | ~tuned)
         if tuned.any() or pressing.any():
             measured = (tuned | pressing) & ~law.stepper[axes]  # no profile has made their velocities
             most[measured] = self._hardest[axes[measured]]

@@ -570,6 +570,23 @@ def test_what_resists_an_axis_that_is_held_back_brakes_it_and_not_all_its_force(
     assert rig.bank.is_idle(rig.axes)
 
 
+@pytest.mark.parametrize("most", (0.01, 0.5))
+def test_the_damping_of_an_axis_that_is_held_back_is_no_kick(most: float) -> None:
+    """With friction it slows down by itself; where its set-point is put, the law has its damping on it at once."""
+    plant = Rough(1.0, mass=0.5, viscous=1.0)
+    rig = rig_of(plant, velocity_max=0.5, k=2000.0, kb=-73.0, force_max=100.0, acceleration_max=8.0)
+    rig.write(mode=VELOCITY, velocity=0.4)
+    rig.tick(500)
+    rig.write(mode=VELOCITY | MAX_FORCE, velocity=0.4, max_force=most, replace=True)
+    rig.tick(30)
+    before = len(rig.history)
+    rig.bank.stop(rig.axes, rig.now_ns)
+    rig.tick(1500)
+    stopped = np.diff(rig.trace("position")[before:]) * 1e3
+    assert -np.diff(stopped).min() * 1e3 < 8.0 + (1.0 + 1.0 * 0.4) / 0.5 + 1.0  # [m/s^2]
+    assert rig.bank.is_idle(rig.axes) and abs(plant.velocity) < 1e-3
+
+
 @pytest.mark.parametrize(("pull", "back"), ((0.0, 0.005), (-5.0, 0.003), (5.0, 0.025)))
 def test_a_force_against_the_motion_that_carries_nothing_does_not_drive_the_axis_back(pull: float, back: float) -> None:
     """It is told from what carries a load by what becomes of the axis when it has turned."""
