@@ -136,8 +136,8 @@ def _first_motions(nodes: list[Any], begin: list[float]) -> list[int | None]:
 
     wait_for(all_have_moved, "all to move")
     firsts: list[int | None] = []
-    for known, start in zip(seen, begin, strict=True):
-        moved = [abs(each.commanded_position[0] - start) > 1e-6 for each in known]
+    for known in seen:
+        moved = [abs(each.commanded_position[0] - known[0].commanded_position[0]) > 1e-6 for each in known]
         first = moved.index(True)
         is_known = first and known[first].stamp_ns - known[first - 1].stamp_ns < 15_000_000
         firsts.append(known[first].stamp_ns if is_known else None)
