@@ -26,7 +26,10 @@ def run(args: argparse.Namespace) -> int:
     from sioms.hand.slow import slowed
 
     try:
-        tables = toml_of(read_bytes(args.config))
+        try:
+            tables = toml_of(read_bytes(args.config))
+        except ValueError as error:
+            raise ValueError(f"read {args.config}: {error}") from None
         text = toml_text(slowed(tables, args.pace, args.config.resolve().parent))
         if args.output is None:
             sys.stdout.write(text)

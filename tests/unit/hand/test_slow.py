@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import copy
 import tomllib
 from pathlib import Path
@@ -12,6 +13,7 @@ import pytest
 from hand_cell_rig import HandCell, write
 
 from sioms.documents import toml_text
+from sioms.hand.command import slow as command
 from sioms.hand.follow import D
 from sioms.hand.slow import slowed
 from sioms.motion.law import ControlLaw
@@ -111,3 +113,10 @@ def test_alarms_and_rights_stay() -> None:
     tables["grant"] = [{"users": ["eva"], "nodes": ["*"], "rights": ["read"]}]
     tables["alarm"] = [{"node": "left", "high": 1.0}, {"node": "right", "high": 2.0}]
     assert tomllib.loads(toml_text(slowed(tables, 0.5, ETC)))["alarm"] == tables["alarm"]
+
+
+def test_a_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
+    (tmp_path / "cell.toml").write_text("Debian 12\n")
+    args = argparse.Namespace(config=tmp_path / "cell.toml", pace=0.5, output=None)
+    with pytest.raises(ValueError, match=r"read .*cell\.toml: Expected '='"):
+        command.run(args)
