@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sioms.tactile import contact, emap
+from sioms.tactile import contact, emap, sensing
 from sioms.tactile.cylinder import FINGER_B
+from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger, nominal_finger
 from sioms.tactile.indenter import Round, Wedge
 from sioms.tactile.touches import Touches
@@ -87,3 +90,19 @@ class Made:
 def made() -> Made:
     """Return a moulded finger."""
     return Made()
+
+
+@pytest.fixture(scope="module")
+def one_estimator() -> Iterator[None]:
+    """Build the estimator of each finger once for all cases: it holds no state from frame to frame."""
+    with pytest.MonkeyPatch.context() as patch:
+        built: dict[bytes, Estimator] = {}
+
+        def estimator(finger: Finger, **options: Any) -> Estimator:
+            key = msgspec.json.encode((finger, options))
+            if key not in built:
+                built[key] = Estimator(finger, **options)
+            return built[key]
+
+        patch.setattr(sensing, "Estimator", estimator)
+        yield

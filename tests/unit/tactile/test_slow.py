@@ -6,22 +6,19 @@ The contacts are those of the plant (`sioms.plant.finger`), whose mechanics shar
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
 import pytest
 
 from sioms.plant.finger import FingerShape, TactileArray
-from sioms.tactile import sensing
-from sioms.tactile.estimator import Estimator
 from sioms.tactile.finger import Finger as CalibratedFinger
 from sioms.tactile.finger import from_toml
 from sioms.tactile.quality import Quality, ShapeEstimate, State
 from sioms.tactile.sensing import ShapeSensor
 
+pytestmark = pytest.mark.usefixtures("one_estimator")
 FINGER = from_toml((Path(__file__).parents[3] / "etc" / "finger.toml").read_text(encoding="utf-8"))
 PLANT = TactileArray(FingerShape(gain=3.0))
 NONE = np.zeros(16)
@@ -53,22 +50,6 @@ class Rig:
 
     def hold(self, output: np.ndarray, seconds: float) -> list[ShapeEstimate]:
         return [self.frame(output) for _ in range(round(seconds * self.rate))]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_estimator() -> Iterator[None]:
-    """Build the estimator once: it holds no state from frame to frame."""
-    with pytest.MonkeyPatch.context() as patch:
-        built: dict[bytes, Estimator] = {}
-
-        def estimator(finger: CalibratedFinger, **options: Any) -> Estimator:
-            key = msgspec.json.encode((finger, options))
-            if key not in built:
-                built[key] = Estimator(finger, **options)
-            return built[key]
-
-        patch.setattr(sensing, "Estimator", estimator)
-        yield
 
 
 def told_at(

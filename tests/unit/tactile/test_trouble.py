@@ -22,13 +22,11 @@ from sioms.drivers.framed_adc.cobs import frame
 from sioms.drivers.framed_adc.driver import FramedAdc
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.protocol.flags import AnalogStatus
-from sioms.tactile import sensing
 from sioms.tactile.chain import RECOVER_S
-from sioms.tactile.estimator import Estimator
-from sioms.tactile.finger import Finger as CalibratedFinger
 from sioms.tactile.quality import Quality, State, state_of
 from sioms.tactile.sensing import CHANNELS
 
+pytestmark = pytest.mark.usefixtures("one_estimator")
 FINGER = str(Path(__file__).parents[3] / "etc" / "finger.toml")
 RATE = 400
 NAMES = [name for name, _, _ in CHANNELS]
@@ -98,22 +96,6 @@ class Finger:
             assert np.mean([one[name] for one in self.seen]) == pytest.approx(truth, abs=most)  # fmt: skip
         rest = self.go(0.05)
         assert rest["touched"] == 0.0 and rest["load"] == 0.0
-
-
-@pytest.fixture(scope="module", autouse=True)
-def one_estimator() -> Iterator[None]:
-    """Build the estimator of the finger once for all cases: it holds no state from frame to frame."""
-    with pytest.MonkeyPatch.context() as patch:
-        built: dict[bytes, Estimator] = {}
-
-        def estimator(finger: CalibratedFinger, **options: Any) -> Estimator:
-            key = msgspec.json.encode((finger, options))
-            if key not in built:
-                built[key] = Estimator(finger, **options)
-            return built[key]
-
-        patch.setattr(sensing, "Estimator", estimator)
-        yield
 
 
 def cases(*values: Any) -> Any:
