@@ -134,7 +134,24 @@ def overlooked(
             wide.append(told)
     best = max(shown.values(), key=lambda m: _worse(data, m, good.model), default=good.model)
     shown = {told: m for told, m in shown.items() if _worse(data, best, m) < CERTAIN}
-    notes = v.notes + (f"not excluded by these rows: {'; '.join(wide)}",) * bool(wide)
+    return _doubting(v, shown, "not excluded by these rows", wide, propose)
+
+
+def _doubting(
+    v: SensorVerdict,
+    shown: dict[str, SensorModel],
+    what: str,
+    wide: Sequence[str],
+    propose: Callable[[Sequence[SensorModel]], tuple[Proposal, ...]],
+) -> SensorVerdict:
+    """Return a verdict with what is not excluded as a note, ambiguous where rows show something beside it.
+
+    Args:
+        v: the verdict; shown: models that rows show, by what is told of each.
+        what: in words, what ``wide`` lists.
+        propose: what decides between models.
+    """
+    notes = v.notes + (f"{what}: {'; '.join(wide)}",) * bool(wide)
     if not shown:
         return replace(v, notes=notes)
     return replace(
@@ -188,14 +205,7 @@ def cancelling(
             shown[" with ".join(told)] = both.model
         elif large and not all(any(f"{v.model.library[n].title}," in note for note in v.notes) for n in (one, other)):
             wide.append(" with ".join(told))
-    notes = v.notes + (f"not excluded by these rows, both at once: {'; '.join(wide)}",) * bool(wide)
-    if not shown:
-        return replace(v, notes=notes)
-    return replace(
-        v, outcome=Outcome.AMBIGUOUS, alternatives=(*v.alternatives, *(tuple(m.effects) for m in shown.values())),
-        experiments=v.experiments or propose([v.model, *shown.values()]),
-        notes=(*notes, f"these rows show, too few to name it: {' or '.join(shown)}"),
-    )  # fmt: skip
+    return _doubting(v, shown, "not excluded by these rows, both at once", wide, propose)
 
 
 def slight(data: HandData, scatter: Sequence[float], model: SensorModel, name: str) -> bool:
