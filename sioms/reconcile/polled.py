@@ -25,6 +25,10 @@ from sioms.reconcile.timing import LEAST_SAMPLES, LONGEST, places
 FEWEST, GAP = 100, float(LONGEST)
 #: Rows that repeat the one before are of a device that is read faster than it has news, where so many do.
 STALE = 0.05
+#: How many rows to either side tell whether it moves.
+ROUND = 3
+#: A step of the encoder is no smaller than this share of the travel: below, numbers were rounded as they were printed.
+ROUNDED = 1e-7
 #: What is interpolated: position as a smooth curve, forces without overshoot.
 FORCES = ("force", "feedforward", "external")
 #: The sample time of the model may be so many usual steps of the log.
@@ -114,12 +118,17 @@ def _times(r: Record) -> Array:
 
 
 def _fresh(r: Record) -> Record:
-    """Return the rows of their own instant; those that repeat the one before, while it moves, are old news."""
+    """Return the rows of their own instant; those that repeat the one before, while it moves, are old news.
+
+    That it moves is seen where it passes more than two steps of the encoder a row: slower motion repeats rows by itself.
+    """
     rows = r.only(np.concatenate([[True], np.diff(_times(r)) != 0.0]))
     values = [a for a in (rows.position, rows.force, rows.force_measured) if a is not None]
     again = np.concatenate([[False], np.all([np.diff(a) == 0.0 for a in values], axis=0)])
-    x = np.pad(rows.position, 3, mode="edge")
-    old = again & (x[6:] != x[:-6])
+    x = np.pad(rows.position, ROUND, mode="edge")
+    moved = np.abs(np.diff(rows.position))
+    steps = moved[moved > ROUNDED * np.ptp(rows.position)]
+    old = again & (np.abs(x[2 * ROUND :] - x[: -2 * ROUND]) > 4.0 * ROUND * np.min(steps, initial=np.inf))
     return rows.only(~old) if np.mean(old) > STALE else rows
 
 

@@ -89,6 +89,17 @@ def test_lost_samples_of_an_even_log_are_not_a_poll() -> None:
     assert not evened(Session((Record("log", place(t), force(t), time_s=t),)), STEP_S)[0].halves
 
 
+@pytest.mark.parametrize("hz", [0.0, 1.3, 3.2])
+def test_slow_motion_between_the_steps_of_an_encoder_is_no_old_news(hz: float) -> None:
+    """A controlled axis creeps to its target: for many rows neither position nor force changes by a step."""
+    t = 0.001 * np.arange(2200)
+    moved = np.maximum(t - 0.2, 0.0)
+    step = 2.0 * np.pi / 200_000
+    x = step * np.floor((1.0 - np.exp(-moved / 0.2) * np.cos(2.0 * np.pi * hz * moved)) / step)
+    session, notes = evened(Session((Record("creeping", x, 3.0 * (1.0 - x), time_s=t),)), 0.001)
+    assert not notes and len(session.records[0]) == len(t)
+
+
 def test_a_gap_parts_the_record_and_rows_that_repeat_old_news_are_left_out() -> None:
     r = polled()
     assert r.time_s is not None
