@@ -120,7 +120,7 @@ def _times(r: Record) -> Array:
 def _fresh(r: Record) -> Record:
     """Return the rows of their own instant; those that repeat the one before, while it moves, are old news.
 
-    That it moves is seen where it passes more than two steps of the encoder a row: slower motion repeats rows by itself.
+    That it moves is seen where it passes more than two steps of the encoder a row: slower motion repeats rows anyway.
     """
     rows = r.only(np.concatenate([[True], np.diff(_times(r)) != 0.0]))
     values = [a for a in (rows.position, rows.force, rows.force_measured) if a is not None]

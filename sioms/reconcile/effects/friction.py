@@ -207,13 +207,13 @@ STRIBECK = Effect(
     equation="F = -(Fc + (Fs - Fc) exp(-(v/vs)^2)) sign(v); at rest it holds up to Fs",
     parameters=(
         Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "level at speed"),
-        Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level"),
+        Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level, Fc or more"),
         Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops"),
     ),
     signature="as Coulomb friction, larger below the Stribeck speed",
     lookalikes=("coulomb", "presliding", "backlash"),
     separate="reversals at several low speeds",
-    ratios=(("Fs", "Fc", 5.0),),
+    ratios=(("Fs", "Fc", 5.0), ("Fc", "Fs", 1.0)),
     replaces=("coulomb", "presliding", "lugre", "coulomb_position"),
 )
 PRESLIDING = Effect(
@@ -263,14 +263,14 @@ LUGRE = Effect(
             vanishes=True,
             steps=UNSEEN_STEPS,
         ),
-        Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level"),
+        Parameter("Fs", "{F}", Ref.FORCE, 0.0, 3.0, 0.08, "breakaway level, Fc or more"),
         Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops", vanishes=True),
     ),
     signature="friction force builds up over a displacement after every reversal and drops with the speed",
     lookalikes=("stribeck", "presliding", "coulomb", "backlash"),
     separate="small reversals of several amplitudes, and reversals at several low speeds",
     session=("state at the start",),
-    ratios=(("Fs", "Fc", 5.0),),
+    ratios=(("Fs", "Fc", 5.0), ("Fc", "Fs", 1.0)),
     replaces=("coulomb", "stribeck", "presliding", "coulomb_position"),
     joins=("stribeck", "presliding"),
 )

@@ -231,6 +231,13 @@ def test_a_power_near_none_is_dry_friction() -> None:
     assert not leans(AXIS.with_effect("power_drag", {"c": 0.1, "n": 1.5}), "power_drag")
 
 
+def test_friction_that_rises_with_the_speed_is_no_drop_at_low_speed() -> None:
+    """A joint with a harmonic drive: friction rises over the first half of the speed and levels off."""
+    for name, beside in (("stribeck", {}), ("lugre", {"xs": 2e-3})):
+        assert leans(AXIS.with_effect(name, {"Fc": 0.18, **beside, "Fs": 0.12, "vs": 0.3}), name)
+        assert not leans(AXIS.with_effect(name, {"Fc": 0.12, **beside, "Fs": 0.18, "vs": 0.3}), name)
+
+
 def test_a_richer_law_that_contains_a_named_one_is_no_look_alike_of_it() -> None:
     """A drag with a power of the speed is quadratic at the exponent two: no record could rule it out."""
     for plain in ("viscous", "quadratic_drag"):
