@@ -26,7 +26,7 @@ from .config import Device
 from .fork_server import ForkServer
 from .journals import journal_file
 from .loop import Loop, Timer
-from .names import DeviceInfo
+from .names import DeviceInfo, part_name
 from .patience import Patience
 from .restarts import Restarts
 
@@ -34,6 +34,8 @@ _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | 0x0010 | fcntl.F_SEAL_SEAL  #
 _SHUTDOWN_S = 3.0
 _ALONE_S = 0.02
 """A process closes the sockets of its devices so long before it has ended, at most [s]."""
+_MOST_HEARD = 1024
+"""More messages than the socket of a driver holds."""
 LOOK_NS = 1_000_000_000
 """How often a driver that is starting is looked at."""
 
@@ -94,6 +96,7 @@ class DriverProcess:
         self.state = State.DOWN
         self.reason = ""
         self.trouble, self._trouble_ns, self._fault_ns = "", 0, 0
+        self._faults: dict[tuple[int, int], tuple[int, str]] = {}
         self.link: tuple[PageState, str] = (PageState.STARTING, "")
         self.generation = 0
         self.pid = 0
@@ -426,6 +429,7 @@ class DriverProcess:
         if self._timer is not None:
             self._timer.cancel()
         was, self.pid = self.state, 0
+        self._faults.clear()
         self.reason = reason
         self.link = (PageState.STALE, reason)
         if was is State.ENDING:
@@ -444,9 +448,29 @@ class DriverProcess:
         """Keep for the status what its driver reports as an error."""
         self.trouble, self._trouble_ns = text, time.monotonic_ns()
 
-    def has_failed_since(self, instant_ns: int) -> bool:
-        """Return whether it is in fault since after an instant [ns, CLOCK_MONOTONIC]."""
-        return self.state is State.FAULT and self._fault_ns > instant_ns
+    def note_fault(self, block: int, channel: int, at_ns: int, text: str) -> None:
+        """Note since when a channel is in fault [ns, CLOCK_MONOTONIC], and why; 0: it is so no longer."""
+        self._faults[block, channel] = (at_ns, text)
+
+    def hear(self) -> None:
+        """Take what its driver has told until now, ahead of its turn."""
+        for _ in range(_MOST_HEARD):
+            if not self._take():
+                break
+
+    def failed_since(self, instant_ns: int, block: int = -1, channels: Sequence[int] = ()) -> str:
+        """Return what has come into fault since an instant, and why, as far as it has told; else ''.
+
+        Args:
+            instant_ns: [ns, CLOCK_MONOTONIC].
+            block, channels: what counts beside the device as a whole; no block: all.
+        """
+        if self.state is State.FAULT and self._fault_ns > instant_ns:
+            return f"{self.name} has failed ({self.reason})"
+        for (number, channel), (at_ns, text) in self._faults.items():
+            if at_ns > instant_ns and (block < 0 or (number == block and channel in channels)):
+                return f"{part_name(self.info, number, channel, -1)} has come into fault ({text})"
+        return ""
 
     def reset(self, sent_ns: int) -> None:
         """Forget its trouble, and start it again, with a clean record, if it is in fault; but for what came later.
@@ -456,6 +480,6 @@ class DriverProcess:
         """
         if self._trouble_ns <= sent_ns:
             self.trouble = ""
-        if self.state is State.FAULT and not self.has_failed_since(sent_ns):
+        if self.state is State.FAULT and self._fault_ns <= sent_ns:
             self.restarts.forget()
             self.start()

@@ -121,7 +121,9 @@ class Processes:
                     self._stops.stop_workcell(f"device {device.name}: {reason}")
                 if not good:
                     self._stops.look_at_inputs(device)
-            case driver_verbs.AlarmChanged(block, channel, bit, what, severity, text):
+            case driver_verbs.AlarmChanged(block, channel, bit, what, severity, text, at_ns):
+                if what == "fault":
+                    device.note_fault(block, channel, at_ns, text)
                 node = part_name(device.info, block, channel, bit)
                 self._alarms.take(node, device.name, what, severity, text)
             case driver_verbs.HeldSilent(name, why):

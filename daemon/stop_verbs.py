@@ -6,13 +6,14 @@ Concurrency: everything runs in the daemon's loop.
 from __future__ import annotations
 
 import errno
+from collections.abc import Iterable, Sequence
 
 from sioms.protocol.text import printable
 from sioms.protocol.verbs import EmergencyStop, Reset, Supervise
 
 from .cell import Cell
 from .clients import Clients
-from .devices import State
+from .devices import DriverProcess, State
 from .node_verbs import NodeVerbs
 from .sessions import Refused, Session
 from .stops import Stops
@@ -82,6 +83,14 @@ class StopVerbs:
         sent_ns = self._cell.timestamps.monotonic_ns(session.timestamp_ns)
         return min(sent_ns, said_ns) if said_ns else sent_ns
 
+    def _refuse_unseen(
+        self, what: str, sent_ns: int, devices: Iterable[DriverProcess], block: int = -1, channels: Sequence[int] = ()
+    ) -> None:  # fmt: skip
+        """Refuse a reset that was sent before a fault which somebody may know of by now: it would not be cleared."""
+        for device in devices:
+            if why := device.failed_since(sent_ns, block, channels):
+                raise Refused(errno.EAGAIN, f"{what}: {why} after this was sent; see why, and reset again")
+
     def reset(self, session: Session, message: Reset) -> None:
         """Reset the workcell, or a node, or the fault of its device."""
         (name,) = message
@@ -91,6 +100,9 @@ class StopVerbs:
                 raise Refused(errno.EPERM, f"reset: {session.peer.user} has no right to write or administer every node")
             if self._supervision.missing:
                 raise Refused(errno.EPERM, "reset: the workcell has no supervisor; start `sioms supervise`")
+            devices = list(self._cell.devices.values())
+            for each in devices:
+                each.hear()  # what it tells may stop something
             if source := self._stops.hear_request():
                 raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
             sent_ns = self._sent_ns(session, said_ns)
@@ -100,22 +112,23 @@ class StopVerbs:
                     errno.EAGAIN,
                     f"reset: the workcell, or a node, stopped{by} after this was sent; see why, and reset again",
                 )
+            self._refuse_unseen("reset", sent_ns, devices)
             self._stops.reset_workcell(str(session), sent_ns, session.number)
             return
         node = self._nodes.find(session, "reset", name, message.right)
         device = self._cell.devices.get(node.device)
+        if device is not None:
+            device.hear()
+        sent_ns = self._sent_ns(session, said_ns)
+        if device is not None:
+            self._refuse_unseen(f"reset {name}", sent_ns, [device], node.block, node.channels)
         if device is not None and device.state is State.FAULT:
-            sent_ns = self._sent_ns(session, said_ns)
-            if device.has_failed_since(sent_ns):
-                why = f"{device.name} has failed after this was sent ({device.reason})"
-                raise Refused(errno.EAGAIN, f"reset {name}: {why}; see why, and reset again")
             device.reset(sent_ns)
             self._cell.log("info", "reset", node=node.name, device=device.name, by=session)
             return
         latch = self._cell.shared.latch
         if latch.stopped_ns:
             raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
-        sent_ns = self._sent_ns(session, said_ns)
         if self._stops.stopped_since(sent_ns, session.number, node):
             raise Refused(errno.EAGAIN, f"reset {name}: stopped after this was sent; see why, and reset again")
         try:

@@ -18,6 +18,7 @@ from typing import Any
 from conftest import PATIENCE_S, Running, pause_s
 
 import sioms
+from sioms.protocol.flags import AxisStatus
 
 AXIS = """
 [[device.{device}.axis]]
@@ -311,6 +312,12 @@ WORKFLOW_S = 500.0
 """Longest that a whole workflow of `sioms reconcile` on a cell may take [s]: alone on two cores one takes 30 to 65 s,
 beside four busy loops at a load of 16 that of a finger took 184.
 """
+
+
+def put_in_fault(axis: sioms.AxisNode) -> None:
+    """Have an axis that is held lag behind its set-points until that is a fault; return when a reading shows it."""
+    axis.command(velocity=1.0, max_force=1e-3, replace=True)
+    wait_for(lambda: axis.read().status[0] & AxisStatus.FAULT, "in fault")
 
 
 class Waiting:

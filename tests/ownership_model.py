@@ -147,7 +147,12 @@ class Step:
         self.answer = "done"
 
     def reset(self, c: int) -> None:
-        if not self._may_write(c) or self._hear_request() == 1:
+        if not self._may_write(c):
+            self.answer = "refused"
+            return
+        for d in range(len(self.devices)):
+            self._listen_first(d)
+        if self._hear_request() == 1:
             self.answer = "refused"
             return
         self.answer = "done"
@@ -170,7 +175,14 @@ class Step:
         if self.devices[d].phase in (STARTING, UP, ENDING) and not self._send(d, STOP):
             self.answer = "refused"  # it holds; but the driver, which has just died, could not be told
 
+    def _listen_first(self, d: int) -> None:
+        """Who judges a reset hears first what drivers have told: of faults, which are not in the model."""
+        if self._driver(d) is not None:
+            self.listen(d)
+
     def reset_node(self, c: int, d: int) -> None:
+        if self._may_write(c):
+            self._listen_first(d)
         there = self.devices[d].phase in (STARTING, UP, ENDING)
         if self._may_write(c) and self.devices[d].phase == FAULT:
             self.answer = "done"  # another try, for the device; what is stopped stays so

@@ -176,6 +176,9 @@ class LinkChanged(Message, on=FROM_DRIVER, verb=DriverVerb.LINK, notice=True):
 class AlarmChanged(Message, on=FROM_DRIVER, verb=DriverVerb.ALARM, notice=True):
     """What a channel's alarm is now, of one bit of it (-1: all): a Severity, and why. ``what`` is the column that is
     watched, or "fault".
+
+    ``at_ns``, of a fault: since when somebody may know of it; it is told before anybody does. A reset that was sent
+    earlier leaves it.
     """
 
     block: Integer
@@ -184,6 +187,7 @@ class AlarmChanged(Message, on=FROM_DRIVER, verb=DriverVerb.ALARM, notice=True):
     what: Text
     severity: Integer
     text: Text
+    at_ns: Integer
 
 
 class HeldSilent(Message, on=FROM_DRIVER, verb=DriverVerb.HELD_SILENT, notice=True):

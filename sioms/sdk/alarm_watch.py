@@ -204,7 +204,7 @@ class AlarmWatch:
     def _take(self, group: Group, i: int, severity: int, text: str) -> None:
         rule, before = group.rules[i], int(group.told[i])
         group.told[i] = severity
-        self._tell(AlarmChanged(rule.block, rule.channel, rule.bit, rule.column, severity, text))
+        self._tell(AlarmChanged(rule.block, rule.channel, rule.bit, rule.column, severity, text, 0))
         if severity <= max(before, 0):
             return
         reaction = (Reaction.NONE, rule.on_minor, rule.on_major, rule.on_invalid)[severity]

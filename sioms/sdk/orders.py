@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 
-from sioms.motion import CommandError
 from sioms.protocol import driver_verbs
 from sioms.protocol.latch import Latch
 from sioms.protocol.verbs import Message
@@ -81,9 +80,4 @@ class Orders:
             stop = self._stops.stop_in_passing if is_over else self._stops.stop_node
             stop(block, order.channels, order.bit, order.source, order.at_ns)
         elif not is_over:
-            try:
-                self._stops.reset_node(
-                    block, order.channels, order.bit, f"reset by {order.source}", order.at_ns, order.sent_ns
-                )
-            except (OSError, CommandError) as error:
-                self._log("warning", str(error))
+            self._stops.reset_for_daemon(block, order.channels, order.bit, order.source, order.at_ns, order.sent_ns)

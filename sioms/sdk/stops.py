@@ -200,36 +200,57 @@ class Stops:
             if stopped_ns:  # also by another driver, which may not have come to note it
                 self._note(workcell_entry(latch.source, stop=True, latched_ns=stopped_ns))
             self._request.take(mark)
-        if not stopped_ns and (self.stopped or is_reset):
+        if is_reset or (self.stopped and not stopped_ns):
             self._effects.note()
-            self.stopped = False
-            self._events.note(Note.RESET, time.monotonic_ns(), "", [])
+            self.stopped = stopped_ns != 0  # again, since then: of its nodes the reset is one all the same
+            if not stopped_ns:
+                self._events.note(Note.RESET, time.monotonic_ns(), "", [])
             for block in self._blocks:
-                self._reset_with_workcell(block)
+                self._reset_seen(block, range(block.n), -1, latch.reset_sent_ns, "the reset of the workcell")
 
-    def _reset_with_workcell(self, block: AnyBlock) -> None:
-        """Clear the stops and faults of a block, but for those that came after the reset of the workcell was sent."""
-        sent_ns = self._latch.reset_sent_ns
-        stopped = self._stopped_of(block, range(block.n), -1)
+    def _reset_seen(self, block: AnyBlock, channels: Iterable[int], bit: int, sent_ns: int, what: str) -> None:
+        """Clear stops and faults of parts of a block, but for those that came after the reset was sent. Of these nobody
+        knew yet when the daemon judged it: for who reads its answer they came after that.
+        """
+        parts = self._parts(block, channels, bit)
         younger = self.asked.since(id(block), sent_ns)
-        kept = [part for part in stopped if part in younger]
+        kept = [part for part in parts if part in younger and self._is_stopped(block, part)]
         if kept:
-            self._note_still(block, kept, "a stop that came during the reset of the workcell")
+            self._note_still(block, kept, f"a stop that came during {what}")
+        if not isinstance(block, AxisBlock):
+            self._clear(block, [part for part in parts if part not in kept])
+            return
+        axes = [axis for axis, _ in parts]
+        unseen = self._unseen_faults(block, axes, sent_ns)
+        if unseen:
+            self._log("warning", f"{self._name(block)} stays in fault: it came during {what}")
+            block.bank.end_stop(unseen)
+        self._clear(block, [part for part in parts if part[0] not in unseen])
+        still = axes if self.stopped else [axis for axis, _ in kept]
+        if still:
+            block.bank.emergency_stop(np.asarray(still, dtype=np.intp), time.monotonic_ns())
+
+    def _is_stopped(self, block: AnyBlock, part: tuple[int, int]) -> bool:
+        """Tell whether a part of a block is under an emergency stop."""
         if isinstance(block, AxisBlock):
-            stopped = [(axis, 0) for axis in range(block.n)]
-            unseen = [axis for axis in self._unseen_faults(block, range(block.n), sent_ns) if (axis, 0) not in kept]
-            if unseen:
-                self._log("warning", f"{self._name(block)} stays in fault: it came during the reset of the workcell")
-                block.bank.end_stop(unseen)
-                kept += [(axis, 0) for axis in unseen]
-        self._clear(block, [part for part in stopped if part not in kept])
+            return block.bank.is_stopped(part[0])
+        return (id(block), *part) in self.latched_outputs
+
+    @staticmethod
+    def _parts(block: AnyBlock, channels: Iterable[int], bit: int) -> list[tuple[int, int]]:
+        return [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
 
     def note_faults(self) -> None:
-        """Note that axes have come into fault, before anybody can see it; cheap where none has."""
+        """Note that axes have come into fault, and tell the daemon, before anybody can see it; cheap where none has."""
         for block in self._axes:
             fresh = block.bank.take_faults()
-            if fresh:
-                self.faults.note(id(block), [(axis, 0) for axis in fresh], time.monotonic_ns())
+            if not fresh:
+                continue
+            now_ns = time.monotonic_ns()
+            self.faults.note(id(block), [(axis, 0) for axis in fresh], now_ns)
+            for axis in fresh:
+                if block.bank.is_in_fault(axis):
+                    self._tell_fault(block, axis, Severity.MAJOR, block.bank.fault_text(axis), now_ns)
 
     def _unseen_faults(self, block: AxisBlock, channels: Iterable[int], sent_ns: int) -> list[int]:
         """Return the axes whose faults nobody can have seen who sent something at an instant [ns, CLOCK_MONOTONIC]."""
@@ -264,8 +285,7 @@ class Stops:
         """Return which parts of some channels are stopped or in fault, by themselves."""
         if isinstance(block, AxisBlock):
             return [(int(axis), 0) for axis in channels if block.bank.is_latched(int(axis))]
-        parts = (part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width))
-        return [part for part in parts if (id(block), *part) in self.latched_outputs]
+        return [part for part in self._parts(block, channels, bit) if self._is_stopped(block, part)]
 
     def look_at_inputs(self) -> None:
         """Stop the workcell when an input that is to stop it reads so."""
@@ -342,10 +362,8 @@ class Stops:
                         names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
                         self._events.note(Note.FAULT, time.monotonic_ns(), names, event.text)
                         self._log("error", f"fault of {names}: {event.text}")
-                        for axis in event.axes:
-                            self._tell_fault(block, int(axis), Severity.MAJOR, event.text)
 
-    def _tell_fault(self, block: AxisBlock, axis: int, severity: Severity, text: str) -> None:
+    def _tell_fault(self, block: AxisBlock, axis: int, severity: Severity, text: str, at_ns: int = 0) -> None:
         """Tell the daemon that an axis is in fault, or is not any more."""
         if severity:
             self._faulty.add((id(block), axis))
@@ -354,7 +372,7 @@ class Stops:
         else:
             self._faulty.discard((id(block), axis))
         number = next(i for i, each in enumerate(self._blocks) if each is block)
-        self._tell(AlarmChanged(number, axis, -1, "fault", severity, text))
+        self._tell(AlarmChanged(number, axis, -1, "fault", severity, text, at_ns))
 
     def _stop_axes(self, reason: Reason, parts: Iterable[Part]) -> None:
         now_ns = time.monotonic_ns()
@@ -390,7 +408,7 @@ class Stops:
             at_ns: when that was asked for [ns, CLOCK_MONOTONIC]; None: now.
             by: number of the handle that asks for it; 0: none.
         """
-        parts = [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
+        parts = self._parts(block, channels, bit)
         self.asked.note(id(block), parts, time.monotonic_ns() if at_ns is None else at_ns, by)
         if not isinstance(block, AxisBlock):
             self.latched_outputs |= {(id(block), *part): source for part in parts}
@@ -400,15 +418,32 @@ class Stops:
         """Carry out an emergency stop, as ``stop_node``, that a reset of the workcell has ended before it was heard of:
         what moves stops, what was sent before is not taken, and nothing stays latched that was not before.
         """
-        before = set(self._stopped_of(block, channels, bit))
+        fresh = [part for part in self._parts(block, channels, bit) if not self._is_stopped(block, part)]
         self.stop_node(block, channels, bit, source, at_ns)
-        stopped = [part for part in self._stopped_of(block, channels, bit) if part not in before]
-        self._note_reset(block, stopped, self._latch.reset_ns)
-        self._clear(block, stopped)
+        self._note_reset(block, fresh, self._latch.reset_ns)
+        faulty: list[tuple[int, int]] = []
+        if isinstance(block, AxisBlock):
+            faulty = [part for part in fresh if block.bank.is_in_fault(part[0])]
+            block.bank.end_stop([axis for axis, _ in faulty])
+        self._clear(block, [part for part in fresh if part not in faulty])
+
+    def reset_for_daemon(self, block: AnyBlock, channels: Any, bit: int, source: str, at_ns: int, sent_ns: int) -> None:
+        """Reset some channels, or one bit of them, as the daemon has acknowledged to somebody.
+
+        Args:
+            block, channels, bit: what is reset.
+            source: who asks for it.
+            at_ns: when it is done: what was sent before is not taken after it [ns, CLOCK_MONOTONIC].
+            sent_ns: when that was sent, or before [ns, CLOCK_MONOTONIC].
+        """
+        stopped = self._begin_reset(block, channels, bit)
+        self._reset_seen(block, channels, bit, sent_ns, f"a reset by {source}")
+        kept = self._stopped_of(block, channels, bit)
+        self._note_reset(block, [part for part in stopped if part not in kept], at_ns)
 
     def reset_node(
-        self, block: AnyBlock, channels: Any, bit: int, what: str, at_ns: int, sent_ns: int,
-        until_ns: int | None = None, by: int = 0,
+        self, block: AnyBlock, channels: Any, bit: int, what: str, at_ns: int, sent_ns: int, until_ns: int | None,
+        by: int,
     ) -> None:  # fmt: skip
         """Clear the latched stop and faults of some channels, or the stop of one bit of them.
 
@@ -421,20 +456,23 @@ class Stops:
         Raises:
             OSError: as ``check_reset``; of what is stopped it is noted that it is so still.
         """
-        stopped = self._stopped_of(block, channels, bit)
+        parts = self._parts(block, channels, bit)
         try:
             self.check_reset(block, channels, bit, what, sent_ns, until_ns, by)
         except OSError:
             # A fault is no stop that outlives this process.
-            still = [part for part in stopped if not isinstance(block, AxisBlock) or block.bank.is_stopped(part[0])]
+            still = [part for part in parts if self._is_stopped(block, part)]
             if still:
                 self._note_still(block, still, "a stop or fault that came during a reset")
             raise
+        self._note_reset(block, self._begin_reset(block, channels, bit), at_ns, by)
+        self._clear(block, parts)
+
+    def _begin_reset(self, block: AnyBlock, channels: Any, bit: int) -> list[tuple[int, int]]:
+        """Tell recorders of a reset; return which parts were stopped or in fault."""
         self._effects.note()
         self._events.note(Note.RESET, time.monotonic_ns(), block.spec.name, [int(c) for c in channels])
-        parts = [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
-        self._note_reset(block, stopped, at_ns, by)
-        self._clear(block, parts)
+        return self._stopped_of(block, channels, bit)
 
     def _clear(self, block: AnyBlock, parts: Iterable[tuple[int, int]]) -> None:
         """Clear the stop and the faults of parts of a block."""
@@ -504,7 +542,7 @@ class Stops:
     def note_node(self, handle: Handle, source: str, *, stop: bool) -> None:
         """Note that a client has stopped or reset the node that it holds or watches."""
         spec = handle.block.spec
-        parts = [part for c in handle.channels.tolist() for part in parts_of(c, handle.bit, spec.channels[c].width)]
+        parts = self._parts(handle.block, handle.channels.tolist(), handle.bit)
         what = f"emergency stop of {handle.node}" if stop else f"reset of {handle.node}"
         self._log("warning", f"{what} by {handle.who}")
         at_ns = time.monotonic_ns() if stop else 0
@@ -530,7 +568,7 @@ class Stops:
                 continue
             self.stop_node(each, channels, bit, source)
             spec = each.spec
-            parts = [part for c in channels for part in parts_of(int(c), bit, spec.channels[c].width)]
+            parts = self._parts(each, channels, bit)
             self._log("warning", f"emergency stop of {name} by {source}")
             at_ns = time.monotonic_ns()
             self._note(

@@ -8,7 +8,7 @@ import socket
 import struct
 
 import pytest
-from daemon_rig import Daemon, Waiting, raises, wait_for
+from daemon_rig import Daemon, Waiting, put_in_fault, raises, wait_for
 
 import sioms
 from sioms.client.channel import Call
@@ -65,6 +65,22 @@ def test_a_reset_that_the_daemon_serves_late_leaves_a_later_stop_past_it(daemon:
         assert _latched(seen) and cell.status()["stopped_ns"]
         cell.reset()
         wait_for(lambda: not _latched(seen), "reset")
+
+
+@pytest.mark.parametrize("name", ["mod0.xaxis", ""])
+def test_a_reset_that_the_daemon_serves_late_is_refused_after_a_fault(
+    daemon: Daemon, cell: sioms.Workcell, name: str
+) -> None:
+    with daemon.cell("owner") as other, other.open("mod0.xaxis", "rw", timeout=5.0) as axis:
+        with daemon.frozen(daemon.pid):
+            resetting = Waiting(lambda: cell.reset(name), None)
+            wait_for(lambda: _sent(cell), "the reset is sent")
+            put_in_fault(axis)
+        assert resetting.errno() == errno.EAGAIN
+        assert "has come into fault" in str(resetting.error) and "xaxis" in str(resetting.error)
+        assert axis.read().status[0] & AxisStatus.FAULT
+        cell.reset(name)
+        wait_for(lambda: not axis.read().status[0] & AxisStatus.FAULT, "reset by who can have seen it")
 
 
 def test_what_one_client_sends_at_once_is_done_in_its_order(daemon: Daemon, cell: sioms.Workcell) -> None:

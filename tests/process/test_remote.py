@@ -226,6 +226,32 @@ def test_a_reset_that_was_under_way_leaves_a_later_stop(
         wait_for(lambda: not seen.read().status[0] & AxisStatus.EMERGENCY_STOP, "reset")
 
 
+@pytest.mark.parametrize("way", ["of the cell", "of the node", "by a reader", "of the workcell"])
+def test_a_reset_of_who_has_not_heard_since_a_fault_is_refused(
+    daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str
+) -> None:
+    """It would clear nothing; the refusal tells why, and whoever resets again then knows of the fault."""
+    with (
+        behind_a_relay(gate) as (relay, far, axis),
+        far.open("mod1.readonly") as reader,
+        cell.open("mod1.readonly") as seen,
+    ):
+        reset = {
+            "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "by a reader": reader.reset,
+            "of the workcell": lambda: far.reset(),
+        }[way]  # fmt: skip
+        axis.command(velocity=1.0, max_force=1e-3)
+        relay.treat(stalled=True)
+        wait_for(lambda: seen.read().status[0] & AxisStatus.FAULT, "in fault")
+        resetting = Waiting(reset)
+        time.sleep(0.1)
+        relay.treat()
+        assert resetting.errno() == errno.EAGAIN
+        assert seen.read().status[0] & AxisStatus.FAULT
+        reset()
+        wait_for(lambda: not seen.read().status[0] & AxisStatus.FAULT, "reset")
+
+
 def test_a_revoked_key_is_out_at_once(daemon: Daemon, gate: Gateway, cell: sioms.Workcell) -> None:
     with sioms.Workcell(gate.socket, "far") as far, far.open("mod1", "rw", lease=10.0):
         gate.keys.revoke(gate.name)

@@ -63,8 +63,11 @@ class Device:
     def tell_use(self, used: bool) -> None:
         """Nothing: no device reads another here."""
 
-    def has_failed_since(self, instant_ns: int) -> bool:
-        return self.state is State.FAULT and self.failed_ns > instant_ns
+    def hear(self) -> None:
+        """Nothing: its driver tells nothing here."""
+
+    def failed_since(self, instant_ns: int, *_: object) -> str:
+        return "io0 has failed" if self.failed_ns > instant_ns else ""
 
     def reset(self, sent_ns: int) -> None:
         self.reset_ns = sent_ns

@@ -92,7 +92,7 @@ def test_a_stop_past_the_daemon_was_asked_for_when_it_was_written(rig: Rig, is_h
     written_ns = time.monotonic_ns()
     rig.request.request(written_ns if is_honest else written_ns - 10**9, PID, "enough")
     rig.latch.stop(written_ns + 1, rig.request.source)  # by a driver
-    sent_ns = time.monotonic_ns()
+    sent_ns = written_ns + 2
     rig.stops.hear_request()
     assert rig.stops.stopped_since(written_ns - 1, 1)
     assert rig.stops.stopped_since(sent_ns, 1) is not is_honest
