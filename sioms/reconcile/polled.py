@@ -95,8 +95,8 @@ class _Rough(NamedTuple):
 
 
 def _rough(r: Record, dt: float) -> _Rough | None:
-    """Return how rough the position is; None where the steps do not vary."""
-    if r.time_s is None or len(r.time_s) != len(r) or len(r) < FEWEST:
+    """Return how rough the position is; None where the steps do not vary, or columns are not as long as each other."""
+    if r.time_s is None or any(len(a) != len(r) for a in r.arrays().values()) or len(r) < FEWEST:
         return None
     rows = _fresh(r)
     t, x = _times(rows), rows.position

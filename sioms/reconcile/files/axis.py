@@ -111,6 +111,9 @@ def read_data(data: Path, model: AxisModel, columns: Path | None = None) -> Sess
     table = parsed(contents(description, where), where)
     only(table, ("sample_time_s", "loop_time_s", "files", "continuous", "final", "columns"), where)
     columns_of = columns_in(table, "columns", QUANTITIES, where)
+    place = columns_of.get("position", {}).get("name")
+    if same := [q for q, spec in columns_of.items() if q != "position" and spec["name"] == place]:
+        raise BadInputError(f"{where}: {place!r} is said to be the position and the {same[0]}; which is it?")
     given = number(table, "sample_time_s", where, model.sample_time_s)
     if not 0.98 < given / model.sample_time_s < 1.02:
         raise BadInputError(
@@ -147,6 +150,12 @@ def _record(path: Path, columns: Mapping[str, Any], model: AxisModel) -> Record:
         head = table.find(str(spec.get("name")))
         if head is None and quantity in SOMETIMES:
             continue
+        text = next((h for h in table.texts if spec.get("name") in (h, named(h)[0])), None)
+        if head is None and text is not None:
+            raise BadInputError(
+                f"read {path.name}: column {text!r} for {quantity} is of text, it begins with "
+                f"{table.texts[text][:30]!r}; needs numbers, or a time of day as 12:30:00.125"
+            )
         if head is None:
             raise BadInputError(
                 f"read {path.name}: no column {spec.get('name')!r} for {quantity}; has "

@@ -79,10 +79,12 @@ def describe(data: Path) -> Draft:
     if not files:
         raise BadInputError(f"describe {data}: no data files; expects one of {', '.join(SUFFIXES)}")
     table = load_table(files[0])
-    table = Table({h: a for h, a in table.columns.items() if len(a) == _rows(table)}, table.units)
+    columns = {h: a for h, a in table.columns.items() if len(a) == _rows(table)}
+    table = Table(columns, table.units, table.texts)
     guesses = guessed(table)
     step, said = _step(table, guesses)
     questions = [*said, *_questions(guesses)]
+    questions += [f"what is {h!r}? It is of text ({t[:30]!r}); it is left out." for h, t in table.texts.items()]
     model, asked = _model(table, guesses, step)
     return Draft(_columns(guesses, step), model, (*questions, *asked))
 

@@ -1,17 +1,20 @@
 """Read tables as instruments and spreadsheets write them: CSV of any dialect, NPZ, MAT, and recordings of one node.
 
 A CSV may part its columns by comma, semicolon, tab or blanks, write 1,5 for 1.5, carry lines of remarks before its
-head, a unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head.
-Without a head its columns are ``column 1``, ``column 2`` and so on. A matrix as MATLAB prints it (``[0 1.5; 1 2.5];``,
+head, a unit in each name (``pos [deg]``, ``pos (deg)``, ``pos/deg``, ``pos_deg``) or a line of units below the head,
+and columns of text, which are left out. Columns without a head, or with one that several have, are ``column 1``,
+``column 2`` and so on. A matrix as MATLAB prints it (``[0 1.5; 1 2.5];``,
 a row a line) may stand for the rows. A
 time of day, with or without a date before it (``2024-02-01 12:30:00.125``), is read as seconds since midnight.
 """
 
 from __future__ import annotations
 
+import csv
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -114,18 +117,25 @@ WIDEST = 64
 REMARKS = 60
 _IN_BRACKETS = re.compile(r"^(.*?)\s*[\[(]\s*([^\])]*?)\s*[\])]$")
 _AFTER_SLASH = re.compile(r"^(.*?)\s*/\s*([^/]+)$")
-_CLOCK = re.compile(r"^(?:\S+[ T])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)Z?$")
+_CLOCK = re.compile(r"^(?:\S+[ T])?(\d{1,2}):(\d\d):(\d\d(?:\.\d+)?)(?:Z|[-+]\d\d:?\d\d)?$")
 _MATRIX = re.compile(r"^\s*(?:\w+\s*=\s*)?\[\s*(?:[-+.\d]|$)")
 _BLANKS = re.compile(r"\s{2,}|\t")
+#: A number with a decimal point, and one with a decimal comma, as whole cells of a line that no comma parts.
+_POINT = re.compile(r"(?:^|[;\s])[-+]?\d+\.\d+(?:[eE][-+]?\d+)?(?=$|[;\s])")
+_COMMA = re.compile(r"(?:^|[;\s])[-+]?\d+,\d+(?:[eE][-+]?\d+)?(?=$|[;\s])")
+_TRUTHS = {"true": 1.0, "false": 0.0}
 _AFTER_BAR = re.compile(r"^(.+)_([^_\W]+)$")
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Columns of one file, shape (n,) each, by their heads; and the units that the heads state, if any."""
+    """Columns of one file, shape (n,) each, by their heads; the units that the heads state, if any; and the first cells
+    of columns of text.
+    """
 
     columns: dict[str, Array]
     units: dict[str, str]
+    texts: Mapping[str, str] = field(default_factory=dict)
 
     def find(self, name: str) -> str | None:
         """Return the head of the column that is meant: as given, or the only one that is so but for its unit."""
@@ -212,32 +222,28 @@ def _text(path: Path) -> Table:
         raw = read_bytes(path, MOST_BYTES)
     except ValueError as error:
         raise BadInputError(f"read {path}: {error}") from None
-    try:
-        lines = raw.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        lines = raw.decode("latin-1").splitlines()
-    lines = [line for line in _unbracketed(lines) if line.strip(" \t,;")]
-    first = next(
-        (
-            i
-            for i in range(min(len(lines), REMARKS))
-            if _numbers(lines[i : i + 1]) is not None and _numbers(lines[i : i + 3]) is not None
-        ),
-        None,
-    )
+    lines = [line for line in _unbracketed(_decoded(raw).splitlines()) if line.strip(" \t,;")]
+    first = next((i for i in range(min(len(lines), REMARKS)) if _begins(lines[i : i + 3])), None)
     if first is None:
         raise BadInputError(
             f"read {path}: no numbers in the first {REMARKS} lines; needs one head line of names and numbers below"
+            f"{_no_number(lines)}"
         )
-    rows = _numbers(lines[first:])
+    texts = _texts(lines[first])
+    rows = _numbers(lines[first:], texts)
     if rows is None:
         bad = next(
             i
             for i in range(first, len(lines))
-            if _numbers([lines[i]]) is None or _numbers([lines[first], lines[i]]) is None
+            if _numbers([lines[i]], texts) is None or _numbers([lines[first], lines[i]], texts) is None
         )
         raise BadInputError(
             f"read {path}: line {bad + 1} is no row of numbers like line {first + 1}: {lines[bad][:60]!r}"
+        )
+    if (mixed := _mixed(lines[first:])) is not None:
+        raise BadInputError(
+            f"read {path}: it writes both {mixed[0]!r} and {mixed[1]!r}: is the point or the comma the decimal one? "
+            "Needs numbers without signs of thousands"
         )
     head, units = _head(lines[:first], rows.shape[1]) if first else (_numbered(rows.shape[1]), [])
     if any(_numbers([cell]) is not None for cell in head):
@@ -246,8 +252,73 @@ def _text(path: Path) -> Table:
         )
     if not head:
         raise BadInputError(f"read {path}: no line of {rows.shape[1]} names over {rows.shape[1]} columns")
-    table = _table({n: np.ascontiguousarray(rows[:, i]) for i, n in enumerate(head)})
-    return Table(table.columns, {**table.units, **{n: u for n, u in zip(head, units, strict=False) if u}})
+    often = Counter(head)
+    head = [n if often[n] == 1 else other for n, other in zip(head, _numbered(len(head)), strict=True)]
+    table = _table({n: np.ascontiguousarray(rows[:, i]) for i, n in enumerate(head) if i not in texts})
+    cells = _cells(lines[first], _sign(lines[first]))
+    return Table(
+        table.columns,
+        {**table.units, **{n: u for n, u in zip(head, units, strict=False) if u}},
+        {head[i]: cells[i] for i in sorted(texts)},
+    )
+
+
+def _decoded(raw: bytes) -> str:
+    """Return a text as spreadsheets of several systems write it."""
+    if raw[:2] in (b"\xff\xfe", b"\xfe\xff"):
+        return raw.decode("utf-16", "replace")
+    for start, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        every_second = raw[start:200:2]
+        if len(every_second) > 1 and not any(every_second):
+            return raw.decode(name, "replace")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
+def _begins(lines: Sequence[str]) -> bool:
+    """Say whether rows begin: all of some lines numbers but for the same columns of text, of which two are none."""
+    texts = _texts(lines[0])
+    cells = len(_cells(lines[0], _sign(lines[0])))
+    if texts and (cells - len(texts) < 2 or any(_texts(line) != texts for line in lines)):
+        return False
+    return _numbers(lines[:1], texts) is not None and _numbers(lines, texts) is not None
+
+
+def _texts(line: str) -> frozenset[int]:
+    """Return which cells of a line are no numbers."""
+    sign = _sign(line)
+    cells = _cells(line.replace(",", ".") if sign != "," else line, sign)
+    return frozenset(i for i, cell in enumerate(cells) if not _is_number(cell))
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        _value(cell)
+    except ValueError:
+        return False
+    return True
+
+
+def _no_number(lines: Sequence[str]) -> str:
+    """Say which cell of the first lines keeps them from being rows of numbers."""
+    for line in lines[1:3]:
+        cells = _cells(line, _sign(line))
+        if bad := [cells[i] for i in sorted(_texts(line)) if i < len(cells)]:
+            return f"; {bad[0][:30]!r} in {line[:60]!r} is none"
+    return ""
+
+
+def _mixed(lines: Sequence[str]) -> tuple[str, str] | None:
+    """Return a number with a point and one with a comma where both stand for a decimal one, None where they do not."""
+    found: list[str] = []
+    for pattern in (_POINT, _COMMA):
+        match = next((m for line in lines if _sign(line) != "," and (m := pattern.search(line))), None)
+        if match is None:
+            return None
+        found.append(match[0].strip("; \t"))
+    return found[0], found[1]
 
 
 def _unbracketed(lines: Sequence[str]) -> Sequence[str]:
@@ -265,7 +336,8 @@ def _numbered(count: int) -> list[str]:
 
 
 def _cells(line: str, sign: str | None) -> list[str]:
-    cells = [c.strip().strip('"').strip() for c in line.strip().split(sign)]
+    parted = next(csv.reader([line.strip()], delimiter=sign)) if sign and '"' in line else line.strip().split(sign)
+    cells = [c.strip().strip('"').strip() for c in parted]
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
 
 
@@ -274,14 +346,17 @@ def _sign(line: str) -> str | None:
     return next((s for s in ";\t," if s in line), None)
 
 
-def _numbers(lines: Sequence[str]) -> Array | None:
+def _numbers(lines: Sequence[str], texts: Collection[int] = ()) -> Array | None:
     """Read rows of numbers, all alike; None where they are none. A comma is a decimal point where it does not part the
     columns.
+
+    Args:
+        texts: columns of text, nan in all rows.
     """
     sign = _sign(lines[0])
     text = [line.replace(",", ".") for line in lines] if sign != "," else lines
     try:
-        rows = [[_value(c) for c in _cells(line, sign)] for line in text]
+        rows = [[np.nan if i in texts else _value(c) for i, c in enumerate(_cells(line, sign))] for line in text]
     except ValueError:
         return None
     return np.array(rows) if len({len(r) for r in rows}) == 1 else None
@@ -292,6 +367,8 @@ def _value(cell: str) -> float:
     try:
         return float(cell) if cell else np.nan
     except ValueError:
+        if cell.lower() in _TRUTHS:
+            return _TRUTHS[cell.lower()]
         if (m := _CLOCK.match(cell)) is None:
             raise
         return 3600.0 * int(m[1]) + 60.0 * int(m[2]) + float(m[3])

@@ -158,3 +158,11 @@ def test_of_a_polled_log_only_what_stands_on_half_its_rows_is_named_and_nothing_
     assert [e.name for e in found.effects] == ["viscous"]
     (b,) = found.effects[0].parameters
     assert b.low < 3e-3 < b.high and found.effects[0].evidence[-1] == "it stands on every other row of the log"
+
+
+def test_columns_of_half_the_rows_are_told_whatever_the_steps() -> None:
+    log = polled()
+    with pytest.raises(BadInputError, match="force has 600 samples, position 1200; needs the same number"):
+        analyse(
+            Session((replace(log, force=log.force[::2]),)), AxisModel(False, STEP_S, 1.0, 0.1, 1e-6, 0.01, 9.0, 1.0)
+        )

@@ -30,6 +30,11 @@ def _folder(tmp_path: Path, text: str, columns: str = COLUMNS, encoding: str = "
     ("\ufeff# bench 3\nDate;12.3.2025\n\nt [ms];pos [°];M [Nm]\n" + ROWS, "utf-8"),
     ("t / ms;pos (deg);M_Nm\n".replace("M_Nm", "M [N m]") + ROWS, "utf-8"),
     ("t [ms];pos [°];M [Nm]\n" + ROWS, "latin-1"),
+    ("t [ms];pos [°];M [Nm]\n" + ROWS, "utf-16"),
+    ("t [ms];pos [°];M [Nm]\n" + ROWS, "utf-16-le"),
+    ("t [ms];pos [°];M [Nm]\n" + ROWS, "utf-16-be"),
+    ("state;t [ms];pos [°];M [Nm];ok\n" + "".join(f'"in; out";{r};TRUE\n' for r in ROWS.split()), "utf-8"),
+    ("t [ms],state,pos [°],M [Nm]\n0,RUN,0,0\n1,RUN,1.5,0.25\n2,HOLD,3.0,0.5\n", "utf-8"),
     ("t;pos;M\nms;deg;Nm\n" + ROWS, "utf-8"),
     ('"t [ms]"\t"pos [deg]"\t"M [Nm]"\n' + ROWS.replace(";", "\t"), "utf-8"),
     ("t [ms],pos [deg],M [Nm]\n" + ROWS.replace(",", ".").replace(";", ","), "utf-8"),
@@ -139,3 +144,27 @@ def test_a_program_reads_and_analyses_without_tools_and_client() -> None:
     )
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
     assert not done.stdout.strip()
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("t [ms];pos [deg];pos [deg];M [Nm]\n0;0;0;0\n1;1;2;1\n2;2;3;2\n", "no column 'pos' .*, column 2, column 3"),
+    ("t [ms];pos [deg];M [Nm]\n0;999;0,5\n1;1.000;0,25\n2;1.001;0,5\n", "both '1.000' and '0,5'"),
+    ("t [ms];pos [deg];M [Nm]\n0;999;0.5\n1;1,000;0.25\n2;1,001;0.5\n", "both '0.5' and '1,000'"),
+    ('t [ms],pos [deg],M [Nm]\n0,"1,5","0,5"\n1,"1,6","0,6"\n2,"1,7","0,7"\n', "no numbers in .* '1,5'"),
+    ("t [ms];pos [deg];M [Nm]\n10:00 AM;0;0\n10:01 AM;1;1\n10:02 AM;2;2\n", "column 't .* is of text, .* '10:00 AM'"),
+])  # fmt: skip
+def test_what_is_read_in_two_ways_is_read_in_none(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(BadInputError, match=message):
+        read_data(_folder(tmp_path, text), AXIS)
+
+
+def test_quoted_commas_do_not_part_columns(tmp_path: Path) -> None:
+    text = '"0,5","1,5","2,5"\n"0,6","1,6","2,6"\n"0,7","1,7","2,7"\n'
+    with pytest.raises(BadInputError, match="no numbers"):
+        load_table(_folder(tmp_path, text) / "run.csv")
+
+
+def test_one_column_is_not_position_and_something_else(tmp_path: Path) -> None:
+    columns = '[columns]\nposition = { name = "pos" }\nforce = { name = "pos" }\n'
+    with pytest.raises(BadInputError, match="'pos' is said to be the position and the force"):
+        read_data(_folder(tmp_path, "t;pos;M\n" + ROWS, columns), AXIS)
