@@ -18,6 +18,8 @@ REST_S = 0.2
 BAD = int(AnalogStatus.INVALID)
 WIDER = 2.0
 """An analog reading may leave the band that it had at rest by so many of its widths."""
+LATER_NS = 50_000_000
+"""What a reading was made of may have come so long after its time stamp [ns]."""
 NOISY, NOISY_S = 50, 0.6
 """Readings of analog nodes that tell how wide that band is, and how long they are waited for [s]."""
 
@@ -92,7 +94,7 @@ class Calm:
                 self.count += 1
                 text = self._differs(node, self._still[i], snapshot)
                 if text and not self.wrong:
-                    self.traffic = self._station.exchanges(12)
+                    self.traffic = self._station.exchanges(12, snapshot.stamp_ns + LATER_NS)
                 if text:
                     self.wrong.append(text)
 

@@ -39,6 +39,8 @@ MOVED_S = 0.05
 """In which an axis that goes on at its rig's speed leaves its tolerance, twice over at least [s]."""
 LOGGED_S = 1.0
 """Longest time until the daemon has written down what a driver has told it; the node shows it at once [s]."""
+LOOKED_AT = 1000
+"""Among so many of the last messages is what a reading was made of, however late somebody looks."""
 LONGEST_PERIOD_S = 0.02
 """Longest time between two looks at what is waited for, unless its caller looks more rarely [s]."""
 PRIORITY = 15
@@ -395,12 +397,24 @@ class Station:
         first, *others = self.tell_wire(f"log {count}")
         return sorted(itertools.chain(first, *others))[-count:] if others else first
 
-    def exchanges(self, count: int = 8) -> list[str]:
-        """Return the last messages as lines to print."""
+    def exchanges(self, count: int = 8, until_ns: int = 0) -> list[str]:
+        """Return messages as lines to print.
+
+        Args:
+            count: how many.
+            until_ns: what was read by then was made of the last of them [ns]; who looks late finds others behind. With
+                them comes the last one that was bent, however long ago. 0: the last of all.
+        """
         if not self.wires:
             return []
-        entries = self.messages(count)
         now_ns = time.monotonic_ns()
+        if until_ns:
+            known = [entry for entry in sorted(self.messages(LOOKED_AT)) if entry[0] <= until_ns]
+            entries = known[-count:]
+            if not any(note for *_, note in entries):
+                entries = [entry for entry in known if entry[3]][-1:] + entries
+        else:
+            entries = self.messages(count)
         return [
             f"{(t_ns - now_ns) / 1e6:9.2f} ms {way} {' '.join(text[i : i + 2] for i in range(0, len(text), 2))}"
             + (f"   ({note})" if note else "")

@@ -200,3 +200,19 @@ def test_calm_is_waited_for_past_a_link_that_is_lost_once_more() -> None:
     seen = Seen()
     _wait_still(seen, Axis("x"))
     assert seen.lost < -1
+
+
+@pytest.mark.parametrize("ago", [3, 250])
+def test_who_looks_late_is_shown_the_messages_that_a_wrong_reading_was_made_of(
+    ago: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The last dozen were of long after it; and a driver that is out of step stays so, long after what was bent."""
+    log = [(1000 * n, "<>"[n % 2], f"{n % 256:02x}", "") for n in range(1000)]
+    log[700] = (*log[700][:3], "9.1 ms late")
+    made: Any = Station.__new__(Station)
+    made.wires = ["wire"]
+    monkeypatch.setattr(Station, "messages", lambda self, count: log[-count:])
+    lines = made.exchanges(12, 1000 * (700 + ago))
+    assert any("late" in line for line in lines) and len(lines) == 12 + (ago > 12)
+    assert lines[-1].split()[3] == f"{(700 + ago) % 256:02x}", "and none of after it"
+    assert not any("late" in line for line in made.exchanges(12)) and len(made.exchanges(12)) == 12
