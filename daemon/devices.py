@@ -28,7 +28,7 @@ from .journals import journal_file
 from .loop import Loop, Timer
 from .names import DeviceInfo, part_name
 from .patience import Patience
-from .restarts import Restarts
+from .restarts import TOO_OFTEN, Restarts
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | 0x0010 | fcntl.F_SEAL_SEAL  # 0x10: F_SEAL_FUTURE_WRITE
 _SHUTDOWN_S = 3.0
@@ -440,6 +440,8 @@ class DriverProcess:
         again_ns = self.restarts.died(time.monotonic_ns())
         self.state, self._fault_ns = State.FAULT if again_ns is None else State.RESTARTING, time.monotonic_ns()
         self._log("error", "device lost", device=self.name, reason=reason, then=self.state.value)
+        if again_ns is None:
+            self.reason = f"{reason}; {TOO_OFTEN}, so it waits for a reset"
         self._owner.device_gone(self, reason)
         if again_ns is not None:
             self._timer = self._loop.at(again_ns, self.start)

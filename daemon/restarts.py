@@ -13,6 +13,7 @@ WINDOW_NS = 60_000_000_000
 QUIET_NS = 5_000_000_000
 LIMIT = 5
 FIRST_PAUSE_NS = 250_000_000
+TOO_OFTEN = f"{LIMIT} deaths within a minute"
 
 
 @dataclass(slots=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import json
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-from daemon_rig import WORKCELL, Daemon, at_rest, raises, wait_for
+from daemon_rig import WORKCELL, Daemon, Waiting, at_rest, raises, wait_for
 from mount_rig import Mount, why_not
 
 import sioms
@@ -228,6 +229,53 @@ def test_a_mount_that_is_killed_halts_and_another_takes_its_place(daemon: Daemon
             assert "mod0.all" in os.listdir(first.folder)
             second.terminate()
             assert second.wait(20) == 0
+
+
+def test_a_mount_outlives_its_daemon(start_daemon: Callable[..., Daemon]) -> None:
+    """What is open is lost, and says so; what is opened is of the daemon that is there; nothing waits for ever."""
+    daemon = start_daemon()
+    with Mount(daemon.socket) as mount:
+        files, path = mount.folder, mount.folder / "mod0/xaxis"
+        reader, writer = os.open(path, os.O_RDONLY), os.open(path, os.O_RDWR)
+        assert os.pread(reader, 200, 0)
+        moving = Waiting(lambda: os.pwrite(writer, b"0.9\n", 0))
+        with daemon.cell() as cell, cell.open("mod0.xaxis.readonly") as seen:
+            wait_for(lambda: seen.read().in_motion[0], "motion")
+        os.kill(daemon.pid, signal.SIGKILL)
+        assert moving.errno() == errno.EIO
+
+        def is_lost(fd: int) -> bool:
+            try:
+                return not os.pread(fd, 200, 0)
+            except OSError as error:
+                assert error.errno == errno.EIO, error
+                return True
+
+        def lost() -> None:
+            look = select.poll()
+            for fd in (reader, writer):
+                wait_for(lambda fd=fd: is_lost(fd), "its driver has braked, and ended")
+                look.register(fd, select.POLLIN | select.POLLOUT)
+            assert {events & select.POLLERR for _, events in look.poll(5000)} == {select.POLLERR}
+            with raises(errno.EIO):
+                os.pwrite(writer, b"0.1\n", 0)
+
+        lost()
+        for line in ("cat mod0/xaxis", "echo 0 > mod1/xaxis"):
+            done = shell(line, files)
+            assert done.returncode and "Connection refused" in done.stderr
+        assert "the daemon" in log(files)
+        with contextlib.ExitStack() as stack:
+            again = Daemon(daemon.folder, WORKCELL)
+            stack.callback(again.end)
+            wait_for(lambda: shell("cat mod0/xaxis", files).returncode == 0, "the mount has found the daemon")
+            assert not float(shell("cat mod0/xaxis", files).stdout.split()[1]), "nothing resumes"
+            lost()
+            os.close(reader)
+            os.close(writer)
+            done = shell("echo 0.01 > mod0/xaxis && cat mod0/xaxis", files)
+            assert float(done.stdout.split()[2]) == pytest.approx(0.01, abs=1e-3), done
+            assert again.pid != daemon.pid
 
 
 def test_the_stop_asks_no_daemon(files: Path, daemon: Daemon, axis: sioms.AxisNode, cell: sioms.Workcell) -> None:
