@@ -93,6 +93,8 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     verdict = on_halves(conclude(s, o, others, burst), s)
     # a log whose rows the controller has not made one by one is of an axis that has it nevertheless
     model = replace(verdict.model, controller=nominal.controller, refine=nominal.refine, within={})
+    if nominal.imposed:
+        model = replace(model, inertia=nominal.inertia)
     return replace(verdict, model=model)
 
 

@@ -187,7 +187,9 @@ def _check_measured(session: Session, model: AxisModel) -> None:
 
 
 def _notes(session: Session, model: AxisModel) -> list[str]:
-    out = []
+    out: list[str] = []
+    if model.imposed:
+        return out
     if all(r.force_measured is None for r in session.records):
         out.append("no force was measured: drive delay, lag and saturation are judged by their effect on motion only")
     if all(r.index is None for r in session.records):

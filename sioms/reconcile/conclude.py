@@ -298,6 +298,9 @@ def _gaps(s: Searched, states: Sequence[State], rng: np.random.Generator) -> tup
         before = measure(plain, nominal, nominal, floor)
         gaps = tuple(replace(g, before=p.before) for g, p in zip(gaps, before, strict=True))
     free = freely((plain, ready.final), (nominal, model), noise, rng)
+    if nominal.imposed:  # small forces that are wrong add up in a motion that they do not make
+        free = tuple(f for f in free if np.isfinite(f.horizon_s))
+        return gaps, judge(ready.final, model, free, gaps, noise.size)
     judged = judge(ready.final, model, free, gaps, noise.size)
     return (*gaps, *free_gaps(free, nominal.position_unit)), judged
 

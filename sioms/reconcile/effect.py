@@ -245,6 +245,17 @@ class Effect(AnyEffect):
         """Whether it is dry friction, whose level follows the run-in of the axis."""
         return self.mechanism.builds_up or (self.slot is Slot.FRICTION and not self.mechanism.warms)
 
+    @property
+    def needs_drive(self) -> bool:
+        """Whether it depends on the force of the drive, or on how it moves an inertia."""
+        if self.channel is not Channel.MECHANICS or self.mechanism.last:
+            return True
+        if self.function is None:
+            return False
+        row = self.row(self.values({p.symbol: p.start for p in self.parameters}), 1.0)
+        some = np.full(2, 0.3)
+        return bool(np.ptp(self.evaluate(some, some, np.array([-0.7, 2.0]), some, row)) > 0.0)
+
     def values(self, given: Mapping[str, float]) -> Array:
         """Order named values.
 

@@ -89,6 +89,8 @@ def variables(motions: list[Motion], model: AxisModel, dead: float) -> dict[str,
             [(np.arange(len(m.x)) + t) * model.sample_time_s for m, t in zip(motions, time, strict=False)],
         ),
     }
+    if model.imposed:
+        del out["motor force"], out["heat"]
     return out
 
 

@@ -51,6 +51,7 @@ class AxisModel:
         effects: values per parameter symbol per effect name; only what is switched on.
         refine: base parameters ("inertia", "viscous") that are uncertain and fitted along, not named.
         driven: False where the axis has no drive: it swings or coasts freely, or only ``external`` moves it.
+        imposed: another machine imposes the motion, and the force is what that takes, as on a friction rig.
         within: bounds of numbers in ``refine`` while effects are searched; one without is only kept from zero.
     """
 
@@ -68,6 +69,7 @@ class AxisModel:
     refine: tuple[str, ...] = ()
     name: str = "axis"
     driven: bool = True
+    imposed: bool = False
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property
@@ -126,7 +128,7 @@ class AxisModel:
 
     def applicable(self, effect: Effect) -> bool:
         """Say whether the effect makes sense on this kind of axis."""
-        return effect.rotary if self.rotary else effect.linear
+        return (effect.rotary if self.rotary else effect.linear) and not (self.imposed and effect.needs_drive)
 
 
 def plant_row(model: AxisModel) -> SimpleNamespace:

@@ -29,7 +29,7 @@ AXIS_NUMBERS: Mapping[str, tuple[str, float | None]] = {
 ABOVE_ZERO = ("sample_time_s", "inertia", "pitch", "rated_force", "max_speed")
 NOT_BELOW_ZERO = ("viscous", "resolution")
 REFINED = ("inertia", "viscous")
-AXIS_KEYS = ("name", "kind", *AXIS_NUMBERS, "refine", "driven")
+AXIS_KEYS = ("name", "kind", *AXIS_NUMBERS, "refine", "driven", "imposed")
 CONTROLLER_NUMBERS = ("k", "kz", "kp", "kb", "offset", "limit", "velocity_filter_hz")
 CONTROLLER_KEYS = (*CONTROLLER_NUMBERS, "velocity_mean")
 
@@ -58,8 +58,11 @@ def model_from(table: Mapping[str, Any], where: str = "read model") -> AxisModel
     only(a, AXIS_KEYS, of_axis)
     if a.get("kind") not in ("rotary", "linear"):
         raise BadInputError(f"{of_axis}: kind is {a.get('kind')!r}; rotary or linear")
+    imposed = truth(a, "imposed", of_axis, False)
+    stands_in = {"inertia": 0.0} if imposed else {}
     numbers: dict[str, Any] = {
-        key: number(a, key, of_axis, instead, about=about) for key, (about, instead) in AXIS_NUMBERS.items()
+        key: number(a, key, of_axis, stands_in.get(key, instead), about=about)
+        for key, (about, instead) in AXIS_NUMBERS.items()
     }
     model = AxisModel(
         rotary=a["kind"] == "rotary",
@@ -67,6 +70,7 @@ def model_from(table: Mapping[str, Any], where: str = "read model") -> AxisModel
         refine=words(a, "refine", of_axis, ", ".join(REFINED)) or (),
         name=str(a.get("name", "axis")),
         driven=truth(a, "driven", of_axis, True),
+        imposed=imposed,
         **numbers,
     )
     effects = table_in(table, "effects", where, needed=False)
@@ -90,13 +94,18 @@ def check_model(model: AxisModel, where: str) -> None:
     """
     for key in ABOVE_ZERO + NOT_BELOW_ZERO:
         value = getattr(model, key)
-        if value < 0.0 or (value == 0.0 and key in ABOVE_ZERO):
+        if value < 0.0 or (value == 0.0 and key in ABOVE_ZERO and not (key == "inertia" and model.imposed)):
             wants = "above zero" if key in ABOVE_ZERO else "zero or more"
             raise BadInputError(f"{where}, [axis]: {key} is {value:g}; needs {wants} ({AXIS_NUMBERS[key][0]})")
     if not set(model.refine) <= set(REFINED):
         raise BadInputError(f"{where}, [axis]: refine is {list(model.refine)}; needs a list of {', '.join(REFINED)}")
     if model.controller is not None and not model.driven:
         raise BadInputError(f"{where}: [controller] beside driven = false; an axis without a drive has no controller")
+    if model.imposed and (odd := _beside_imposed(model)):
+        raise BadInputError(
+            f"{where}: {odd} beside imposed = true; where another machine imposes the motion there is no drive, and no "
+            "inertia to refine"
+        )
     if model.controller is not None and not model.controller.limit > 0.0:
         raise BadInputError(
             f"{where}, [controller]: limit is {model.controller.limit:g}; needs the largest force, above zero"
@@ -107,6 +116,14 @@ def check_model(model: AxisModel, where: str) -> None:
                 raise BadInputError(
                     f"{where}, [effects.{name}]: {p.symbol} is {values[p.symbol]:g}; needs zero or more, {p.text}"
                 )
+
+
+def _beside_imposed(model: AxisModel) -> str:
+    """Say what cannot stand in a model whose motion is imposed; empty where nothing is."""
+    effects = [f"[effects.{name}]" for name in model.effects if not model.applicable(known()[name])]
+    others = {"[controller]": model.controller is not None, "driven = false": not model.driven}
+    refined = ['refine = ["inertia"]'] if "inertia" in model.refine else []
+    return ", ".join([*(name for name, there in others.items() if there), *refined, *effects])
 
 
 def _controller(table: Mapping[str, Any], where: str) -> Controller:
@@ -128,6 +145,8 @@ def write_model(model: AxisModel, off: Container[str] = ()) -> str:
     lines.append(f"refine = {json.dumps(list(model.refine))}")
     if not model.driven:
         lines.append("driven = false")
+    if model.imposed:
+        lines.append("imposed = true")
     if model.controller is not None:
         lines += ["", "[controller]"]
         lines += [f"{key} = {_toml(getattr(model.controller, key))}" for key in CONTROLLER_KEYS]

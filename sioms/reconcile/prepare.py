@@ -16,6 +16,7 @@ from sioms.reconcile.effects import library
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
+from sioms.reconcile.imposed import carried
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.polled import evened
@@ -109,6 +110,8 @@ def _prepared(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     session, polled = evened(session, nominal.sample_time_s)
     session, notes = on_grid(session, nominal.sample_time_s)
     notes = [*polled, *notes]
+    if nominal.imposed:
+        session, nominal = carried(session, nominal)
     session, left_out = usable(session, searched(session), nominal)
     notes += left_out
     notes += check(session, nominal)
@@ -138,8 +141,9 @@ def _polled(session: Session, nominal: AxisModel, notes: Sequence[str], o: Optio
     else:
         plain = _channels(session, nominal, notes, o)
         sampling = sampling_of(plain.problem, plain.model) or Sampling(0.0)
-    sampling = Sampling(0.0) if sampling.late is None else sampling
-    ready = _read(session, nominal, [*notes, sampling.text(nominal.sample_time_s)], o, sampling)
+        sampling = Sampling(0.0) if sampling.late is None else sampling
+        notes = [*notes, sampling.text(nominal.sample_time_s)]
+    ready = _read(session, nominal, notes, o, sampling)
     return replace(ready, names=tuple(n for n in ready.names if n not in TIMES and not _between_rows(n)))
 
 

@@ -141,6 +141,8 @@ def from_files(
     models = {i: parse_model(text, path) for i, (path, text) in files.items()}
     for i, model in models.items():
         name, unit = axes[i]
+        if model.imposed:
+            raise ValueError(f"model_file {files[i][0]}: imposed = true, of a rig; want the model of an axis")
         if model.rotary != (unit == "rad"):
             kind = "rotary" if model.rotary else "linear"
             raise ValueError(f"model_file {files[i][0]}: of a {kind} axis; {name} is in {unit}")

@@ -254,7 +254,11 @@ def _model(table: Table, guesses: list[Guess], step: float | None) -> tuple[str,
 
     line("kind", f'"{kind}"' if kind else None, "rotary or linear, by the units" if kind else "rotary or linear?")
     line("sample_time_s", f"{step:.9g}" if step else None, "time between two rows")
-    line("inertia", None, "kg or kg m^2, of the data sheet")
+    line(
+        "inertia",
+        None,
+        "kg or kg m^2, of the data sheet; none, but imposed = true, of a rig that another machine moves",
+    )
     line("viscous", "0.0", "N s/m or N m s/rad; 0 where it is not known: it is then named")
     line("pitch", None, "m or rad: lead of the screw or a turn; the period of what is periodic")
     force, place = by.get("force"), by.get("position")

@@ -70,6 +70,11 @@ def live(node: str, nominal: AxisModel, settings: Live, folder: Path, say: Say) 
         ExperimentStopped: the experiment was stopped; the axis is halted.
         OSError: the daemon or the node cannot be reached.
     """
+    if nominal.imposed:
+        raise BadInputError(
+            f"measure {node}: the model says imposed = true, of a rig that another machine moves; record it, and give "
+            "the folder of the records instead of the node"
+        )
     with sioms.Workcell(settings.socket, "reconcile") as cell:
         channel = _channel(cell.info(node), nominal)
         with cell.open(f"{node}.readonly") as axis:
