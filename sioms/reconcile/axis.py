@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sioms.reconcile.ambiguity import settle
+from sioms.reconcile.ambiguity import rivals, settle
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
@@ -22,6 +22,7 @@ from sioms.reconcile.effects.smooth import LAWS
 from sioms.reconcile.effects.terms import TERMS
 from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
+from sioms.reconcile.form import of_any_form
 from sioms.reconcile.halves import on_halves
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import leans
@@ -90,6 +91,10 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
     if found is not s.found:
         s = replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
         burst = bursts(s.ready.problem, found.fit)
+    if (formed := of_any_form(s.searcher, s.found)) is not s.found:
+        o.progress("a smooth law does better than what is named of its variable")
+        s = replace(s, found=formed, share=smoother_share(s.ready.problem, formed.fit))
+        burst, others = bursts(s.ready.problem, formed.fit), rivals(s.searcher, formed, s.excited.pairs)
     verdict = on_halves(conclude(s, o, others, burst), s)
     # a log whose rows the controller has not made one by one is of an axis that has it nevertheless
     model = replace(verdict.model, controller=nominal.controller, refine=nominal.refine, within={})

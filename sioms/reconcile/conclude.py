@@ -4,7 +4,7 @@ next.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -43,7 +43,9 @@ from sioms.reconcile.thresholds import (
     AXIS,
     BURSTS,
     CHANCE,
+    DWARFED,
     LARGE,
+    LOUD,
     MISSED,
     MOSTLY,
     PLACES_A_PERIOD,
@@ -68,6 +70,7 @@ PAYLOAD = "payload"
 REFUSED_FREE = "the model with it does not move as the machine did"
 REFUSED_BEYOND = "too much remains beside it for a part to be told"
 REFUSED_IDLE = "held-out samples are met as well without it: it may stand for a part of what remains"
+REFUSED_SMALL = "beside a formula without a name that explains far more it may be what that formula lacks"
 REFUSED_BOUND = "a number of it is at the end of what it can be: it stands for something else"
 
 
@@ -106,14 +109,14 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     ends = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
     travel = max(high for _, high in ends) - min(low for low, _ in ends)
     told = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
-    named, terms = formulas(*told, travel / nominal.pitch)
+    named, terms = formulas(*told, travel / nominal.pitch, {n for force in ready.timed for n in force.beside})
     terms += [force.term for force in ready.timed]
     open_rivals = [r for r in others if r.open]
     ratio = found.fit.ratio
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
-    beyond = ratio > LARGE
+    beyond = ratio > (LARGE if named or terms else LOUD)
     if runs_away(found.fit.model):
         judged = replace(judged, refusals=(*judged.refusals, _of_inertia(nominal, found.fit.model)))
     missing = bool(terms) or bool(leaning) or disturbance or beyond or odd or bool(judged.refusals)
@@ -137,6 +140,9 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         tried += tuple(Candidate(e.name, e.title, REFUSED_FREE) for e in terms if e.name in fit.model.effects)
     elif said is Outcome.UNEXPLAINED and not rattles(fit.model):
         tried += _idle(s, (*named, *terms), tried)
+        small = [e for e in named if e.name not in s.searcher.frozen and dwarfed(e, terms)]
+        gone = {c.name for c in tried}
+        tried += tuple(Candidate(e.name, e.title, REFUSED_SMALL) for e in small if e.name not in gone)
     terms = [e for e in terms if e.name not in {c.name for c in tried}]
     found_here = [e for e in named if e.name not in {c.name for c in tried}]
     others_said = _alternatives(fit.model, found_here, open_rivals, blindly) if said is Outcome.AMBIGUOUS else ()
@@ -191,6 +197,17 @@ def doubted(effect: NamedEffect, ratio: float) -> bool:
     return ratio > AXIS.floor and explained < REMAINS * (ratio**2 - 1.0)
 
 
+def dwarfed(effect: NamedEffect, terms: Sequence[NamedEffect]) -> bool:
+    """Say whether an effect explains so much less than a nameless term beside it that it may be an error of its form.
+
+    Both in units of what remains.
+    """
+    explained, most = (
+        max((e.saved / max(1.0 - e.saved, 1e-300) for e in group), default=0.0) for group in ([effect], terms)
+    )
+    return explained < DWARFED * most
+
+
 def _of_doubts(titles: Sequence[str]) -> str:
     return (
         f"{' and '.join(titles)}: less is explained by it than remains above the noise, so it may be a part of what "
@@ -199,7 +216,7 @@ def _of_doubts(titles: Sequence[str]) -> str:
 
 
 def formulas(
-    named: Sequence[NamedEffect], terms: Sequence[NamedEffect], pitches: float = 0.0
+    named: Sequence[NamedEffect], terms: Sequence[NamedEffect], pitches: float = 0.0, changing: Collection[str] = ()
 ) -> tuple[list[NamedEffect], list[NamedEffect]]:
     """Take its name from an effect beside which a nameless term of the same variable stands: together they are one law
     of that variable, of which nobody can tell how much the effect is; so are a constant and a law without a zero of its
@@ -207,13 +224,14 @@ def formulas(
 
     Args:
         pitches: travel of the records.
+        changing: what may be a part of a number that changes in time.
 
     Returns:
         What is named, and the formulas without a name.
     """
     beside = {t.name for t in terms}
     laws = [law for law in LAWS if beside & {law.name, *law.replaces}]
-    within = {n for law in laws for n in (*law.replaces, CONSTANT.get(law.name, ""))}
+    within = {n for law in laws for n in (*law.replaces, CONSTANT.get(law.name, ""))} | set(changing)
     if any(law.over is Over.PLACE for law in laws):
         within |= {e.name for e in named if _seldom(e, pitches)}
     parts = [replace(e, title=e.equation) for e in named if e.name in within]

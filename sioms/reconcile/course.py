@@ -22,6 +22,7 @@ class Course:
         left: squares of the whole residual that they leave.
         count: of the numbers that were fitted.
         again: fits the same course to another view.
+        beside: effects that may be a part of it, as of ``Timed``.
     """
 
     name: str
@@ -32,6 +33,7 @@ class Course:
     left: float
     count: int
     again: Callable[[View], Course]
+    beside: tuple[str, ...] = ()
 
     def timed(self, share: float) -> Timed:
         """Describe the force, which is this share of the residual's energy."""
@@ -49,7 +51,7 @@ class Course:
             None,
             (said,),
         )
-        return Timed(self.forces, self.left, term, self.text)
+        return Timed(self.forces, self.left, term, self.text, self.beside)
 
 
 def estimate(view: View, number: Number, size: float, spread: float) -> Estimate:

@@ -29,14 +29,14 @@ def formulas_of(model: AxisModel, law: str, names: Sequence[str]) -> list[tuple[
         return []
     row = effect.row(effect.values(model.effects[law]), model.pitch)
     at = row[CENTRE] + row[STEP] * np.linspace(-SIDE, SIDE, 8 * SIDE + 1)
-    curve = _over(effect, effect.over, at, row)
+    curve = over(effect, effect.over, at, row)
     found: list[tuple[float, AxisModel, str]] = []
     for other in (o for o in effect.replaces if o in names and size(o) == 1 and vacant(model, law, o)):
         one = known()[other]
         if one.slot is not effect.slot:
             continue
         # the constant of a law is the offset's
-        columns = np.column_stack([_over(one, effect.over, at, one.row(np.ones(1), model.pitch)), np.ones_like(at)])
+        columns = np.column_stack([over(one, effect.over, at, one.row(np.ones(1), model.pitch)), np.ones_like(at)])
         number, constant = np.linalg.lstsq(columns, curve, rcond=1e-12)[0]
         left = float(np.sum((curve - columns @ (number, constant)) ** 2) / max(np.sum(curve**2), 1e-300))
         p = one.primary
@@ -46,10 +46,10 @@ def formulas_of(model: AxisModel, law: str, names: Sequence[str]) -> list[tuple[
     return [(swap, other) for _, swap, other in sorted(found, key=lambda f: f[0])]
 
 
-def _over(effect: Effect, over: Over, at: Array, row: Array) -> Array:
+def over(effect: Effect, variable: Over, at: Array, row: Array) -> Array:
     """Return what the state function of an effect gives over one variable, at unit speed where that is the place."""
-    x, v, u = (at if name == over.value else np.zeros_like(at) for name in "xvu")
-    return effect.evaluate(x, v + 1.0 if over is Over.PLACE else v, u, np.zeros_like(at), row)
+    x, v, u = (at if name == variable.value else np.zeros_like(at) for name in "xvu")
+    return effect.evaluate(x, v + 1.0 if variable is Over.PLACE else v, u, np.zeros_like(at), row)
 
 
 def swapped(model: AxisModel, name: str, other: str) -> AxisModel:

@@ -7,7 +7,7 @@ from scipy.linalg import block_diag
 
 from sioms.reconcile.course import Course, estimate
 from sioms.reconcile.effect import Array
-from sioms.reconcile.thresholds import GAIN
+from sioms.reconcile.thresholds import GAIN, WHOLE_SWING
 from sioms.reconcile.timed import waves
 from sioms.reconcile.verdict import Estimate
 from sioms.reconcile.windows import Number, Read, View
@@ -60,6 +60,7 @@ def _course(view: View, number: Number, hz: float, sized: tuple[Array, Array, fl
         left * len(view.residual) / len(view.rows),
         1 + len(size),
         lambda view: _course(view, number, hz, _sized(view, number, hz, steady), steady),
+        number.effects if hz * longest < WHOLE_SWING else (),
     )
 
 

@@ -128,6 +128,10 @@ REMAINS = 1.0
 """An effect that explains less than so many times what remains above the noise may be a part of that, and is told with
 and without. Twenty-three axes of seeds 972801 and 972802: 0.3 twice, of effects that were not there; of those that were
 13 and more (1041)."""
+DWARFED = 0.02
+"""Beside a nameless term an effect explains at least this share of what that does, or it may be what the term's form
+lacks: a tanh for a dead band left 3 times the noise, of which a swinging load that was not there took half: 0.005 of
+the term's (seed 972802, 1044)."""
 CLIPPED = 0.1
 """Dry friction is less than none where terms that lower it take more than there is; in this share of the motion it is
 no friction. Two axes of seeds 972801 and 972802 without the effect they hide: 0.73 and 0.48; what was there 0
@@ -162,7 +166,9 @@ LARGE = 3.0
 """A residual beyond this multiple of the floor is no noise, whatever it looks like; beside a gap when bent (0080)."""
 LOUD = 1.4
 """Above this multiple a nameless term is looked for though no smoother explains anything: a bend in force is no
-function of motion. Set A (0073).
+function of motion. Set A (0073). That nothing is missing is not said above it: eight drawn axes with nothing hidden
+and no measured current, whose noise is least known, leave 1.12 at most; a swinging load that the library had not, 2.8
+(1045).
 """
 QUIET = 1.6
 """Below this multiple nothing is called a burst; above it a sensor is searched again with nameless terms. 49 force
@@ -233,6 +239,10 @@ PROMISING = 0.5
 EARNED, SECOND, REGULAR = 20.0, 0.6, 0.05
 """A switch saves so many times what it would of noise; a second number that switches with the first leaves at most this
 share; switches come at regular times where their intervals differ by no more than the last. Fifteen axes (0082)."""
+WHOLE_SWING = 1.0
+"""The value about which a number swings is told by so many periods of the swing in the longest record: of less, value
+and swing are one course. Friction that warmed up over 5 s: half a period, about a level of dry friction that there was
+not (seed 972801, 1044)."""
 TONE = 0.5
 """A line of this share of the residual's energy is no noise: of noise the strongest holds less than 0.1, of a vibration
 0.9 and more. Set D (0075).

@@ -25,12 +25,15 @@ class Timed:
         left: squares of the residual that it leaves.
         term: how the verdict describes it.
         text: what is told of it while the work goes on.
+        beside: effects that may be a part of it: of a number that swings by less than a whole period nobody can tell
+            about which value it does.
     """
 
     forces: tuple[Array, ...]
     left: float
     term: NamedEffect
     text: str
+    beside: tuple[str, ...] = ()
 
 
 def waves(count: int, frequency_hz: float, dt: float) -> Array:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from sioms.reconcile.effect import Array
+from sioms.reconcile.effects.smooth import DRY
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.noise import corrections, effective_samples
 from sioms.reconcile.screen import MOST_ROWS, dead_band, direction, orthonormal, smoothed_motion
@@ -44,13 +45,18 @@ class Seen:
 
 @dataclass(frozen=True, slots=True)
 class Number:
-    """A number of the axis, by the force that one unit more of it makes where it is about ``size``, 0 for unknown."""
+    """A number of the axis, by the force that one unit more of it makes where it is about ``size``, 0 for unknown.
+
+    Attributes:
+        effects: what its steady part is called.
+    """
 
     symbol: str
     force: str
     unit: str
     text: str
     column: Callable[[Seen, float], Array]
+    effects: tuple[str, ...] = ()
 
 
 def _dry(s: Seen, size: float) -> Array:
@@ -68,10 +74,10 @@ def _inert(s: Seen, size: float) -> Array:
 
 NUMBERS = (
     Number("g", "g u", "1", "gain of the drive", lambda s, size: s.u),
-    Number("m", "-m a", "{F} s^2/{x}", "inertia", _inert),
-    Number("Fc", "-Fc sign(v)", "{F}", "dry friction", _dry),
-    Number("c", "-c v", "{F} s/{x}", "viscous friction", lambda s, size: -s.v),
-    Number("w", "w", "{F}", "constant force", lambda s, size: np.ones_like(s.v)),
+    Number("m", "-m a", "{F} s^2/{x}", "inertia", _inert, ("payload",)),
+    Number("Fc", "-Fc sign(v)", "{F}", "dry friction", _dry, DRY),
+    Number("c", "-c v", "{F} s/{x}", "viscous friction", lambda s, size: -s.v, ("viscous",)),
+    Number("w", "w", "{F}", "constant force", lambda s, size: np.ones_like(s.v), ("offset",)),
 )
 
 

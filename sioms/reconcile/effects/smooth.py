@@ -26,6 +26,8 @@ from sioms.reconcile.jit import state_function
 
 #: Places to either side of the middle.
 SIDE = 4
+#: These places, in steps from the middle.
+PLACES = (*range(-SIDE, 0), *range(1, SIDE + 1))
 #: Where a row has the middle and the step; of the values the eighth comes after the place of the pitch.
 CENTRE, STEP = 2 * SIDE + 1, 2 * SIDE + 2
 
@@ -87,9 +89,8 @@ def _law(
 ) -> Effect:
     """Make a law; ``units``: of its values, their natural size, and the unit of its variable."""
     unit, size, of = units
-    places = [*range(-SIDE, 0), *range(1, SIDE + 1)]
     values = tuple(Parameter(f"s{i}", unit, size, -50.0, 50.0, 0.05, f"value {at:+d} steps from the middle")
-                   for i, at in enumerate(places, 1))  # fmt: skip
+                   for i, at in enumerate(PLACES, 1))  # fmt: skip
     laid = tuple(Parameter(symbol, of, Ref.ONE, -1e12, 1e12, 1.0, text, fixed=True, shape=True)
                  for symbol, text in (("middle", "the middle place"), ("step", "from place to place")))  # fmt: skip
     return Effect(
@@ -129,6 +130,9 @@ LAWS = (
     _law("friction_by_place", "smooth law of position, against the motion", "F = -s(x) sign(v), s a broken line",
          by_place, Over.PLACE, ("{F}", Ref.FORCE, "{x}"), ("coulomb_position", "term_place_friction"),
          Slot.FRICTION, DRY),
+    _law("friction_by_force", "smooth law of the motor force, against the motion",
+         "F = -s(u) sign(v), s a broken line", by_force, Over.FORCE,
+         ("{F}", Ref.FORCE, "{F}"), ("load_friction", "load_square_friction"), Slot.FRICTION),
 )  # fmt: skip
 #: What has the constant of a law, which is zero in the middle by convention alone.
 CONSTANT = {

@@ -85,7 +85,10 @@ SWINGING_LOAD = Effect(
     sized=False,
     equation="as two masses: (1-r) J hold the axis, r J hang on it and swing about it at f_res",
     parameters=(
-        Parameter("f_res", "Hz", Ref.FREQUENCY, 0.15, 2.0, 0.8, "frequency of the pair, the axis let go"),
+        # slower than that it does not come back within a record: it is a mass, or a force along the way
+        Parameter(
+            "f_res", "Hz", Ref.FREQUENCY, 0.15, 2.0, 0.8, "frequency of the pair, the axis let go", vanishes=True
+        ),
         Parameter("load_fraction", "1", Ref.ONE, 0.03, 0.97, 0.3, "share of the inertia that swings"),
         Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.02, "damping ratio"),
     ),

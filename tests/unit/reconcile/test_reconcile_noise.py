@@ -94,6 +94,8 @@ def test_a_motion_without_noise_is_found_without_a_loop() -> None:
     ("stribeck", {"Fc": 0.05, "Fs": 0.1, "vs": 0.2}, True),
     ("stribeck", {"Fc": 0.01, "Fs": 0.1, "vs": 0.2}, False),
     ("offset", {"off": -0.7}, False),
+    ("swinging_load", {"f_res": 0.8, "load_fraction": 0.4, "zeta": 0.02}, True),
+    ("swinging_load", {"f_res": 0.15, "load_fraction": 0.4, "zeta": 0.02}, False),
     ("thermal_gain", {"loss": 0.3, "tau": 10000.0}, True),
     ("backlash", {"gap": 0.01, "load_fraction": 0.4, "f_contact": 400.0, "zeta": 2.0}, True),
 ])  # fmt: skip
