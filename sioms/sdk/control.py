@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import socket
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import TypeAlias
 
 from sioms.descriptors import has_ended, receive
@@ -18,6 +18,8 @@ from sioms.protocol.verbs import Message, take
 
 MOST_AHEAD = 512
 """More messages than the daemon's socket holds: what is behind them has been sent since they were begun with."""
+MOST_UNSENT = 4096
+"""Messages that wait for a daemon that is held up; log lines beyond a sixteenth of it are dropped, all beyond it."""
 Order: TypeAlias = driver_verbs.NodeStop | driver_verbs.NodeReset
 Received: TypeAlias = tuple[Message, list[int]]
 
@@ -27,12 +29,15 @@ class Control:
 
     Args:
         fd: its descriptor.
+        room: told whether to watch for room in the socket, for ``send_rest``.
     """
 
-    def __init__(self, fd: int) -> None:
+    def __init__(self, fd: int, room: Callable[[bool], None] = lambda wanted: None) -> None:
         self._sock = socket.socket(fileno=fd)
         self._sock.setblocking(False)
         self._kept: deque[Received] = deque()
+        self._unsent: deque[bytes] = deque()
+        self._room = room
 
     def fileno(self) -> int:
         return self._sock.fileno()
@@ -48,11 +53,33 @@ class Control:
         return not self._kept and has_ended(self._sock)
 
     def tell(self, message: Message) -> None:
-        """Send the daemon a message."""
+        """Send the daemon a message; when there is room, if it has left none."""
+        is_kept = len(self._unsent) < (MOST_UNSENT >> 4 if isinstance(message, driver_verbs.LogLine) else MOST_UNSENT)
+        if self._unsent:
+            if is_kept:
+                self._unsent.append(message.packed())
+            return
         try:
             self._sock.send(message.packed())
+        except BlockingIOError:
+            self._unsent.append(message.packed())
+            self._room(True)
         except OSError:
             return  # a daemon that is gone is noticed by its end of file, a hung one by its lease
+
+    def send_rest(self) -> None:
+        """Send what there was no room for."""
+        if not self._unsent:
+            return
+        try:
+            while self._unsent:
+                self._sock.send(self._unsent[0])
+                self._unsent.popleft()
+        except BlockingIOError:
+            return
+        except OSError:
+            self._unsent.clear()
+        self._room(False)
 
     def tell_ready(self, pages: Sequence[int]) -> None:
         """Tell the daemon that publishing has begun, with the descriptors of the pages."""

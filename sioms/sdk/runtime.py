@@ -86,7 +86,7 @@ class Runtime:
         self.looked_ns = 0
         self.outputs = Outputs()
         self.statistics = TickStatistics()
-        self._control = Control(fds[0])
+        self._control = Control(fds[0], self._watch_room)
         self.tell = self._control.tell
         latch = mmap.mmap(fds[1], LATCH_SIZE)
         self.latch, self._latch_words = Latch(memoryview(latch)), np.frombuffer(latch, dtype=np.int64, count=8)
@@ -658,8 +658,13 @@ class Runtime:
         for fd in self.pages.fds:
             os.close(fd)
 
+    def _watch_room(self, wanted: bool) -> None:
+        if self._control.fileno() in self._callbacks:
+            self._epoll.modify(self._control.fileno(), select.EPOLLIN | (select.EPOLLOUT if wanted else 0))
+
     def _control_readable(self) -> None:
         """Obey one message of the daemon; the tick has its turn before the next."""
+        self._control.send_rest()
         try:
             received = self._control.take()
         except EOFError:

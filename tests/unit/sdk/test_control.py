@@ -6,8 +6,19 @@ import socket
 
 import pytest
 
-from sioms.protocol.driver_verbs import InUse, NodeReset, NodeStop, Shutdown
-from sioms.sdk.control import MOST_AHEAD, Control
+from sioms.descriptors import is_readable
+from sioms.protocol.driver_verbs import (
+    FROM_DRIVER,
+    HeldSilent,
+    InUse,
+    LogLine,
+    MarkerSignalled,
+    NodeReset,
+    NodeStop,
+    Shutdown,
+)
+from sioms.protocol.verbs import Message, take
+from sioms.sdk.control import MOST_AHEAD, MOST_UNSENT, Control
 
 
 def _pair() -> tuple[socket.socket, Control]:
@@ -38,4 +49,30 @@ def test_messages_that_do_not_end_do_not_hold_up_a_tick(monkeypatch: pytest.Monk
     assert not [*control.orders()]
     assert len(control._kept) == MOST_AHEAD
     daemon.close()
+    control.close()
+
+
+def test_what_a_daemon_that_is_held_up_has_left_no_room_for_is_sent_later_in_its_order() -> None:
+    """A fault, a lost link, a node that takes no orders: nothing tells of them again."""
+    daemon, driver = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    watched: list[bool] = []
+    control = Control(driver.detach(), watched.append)
+    told: list[Message] = [*(MarkerSignalled(n) for n in range(1000)), HeldSilent("mod0", "mute")]
+    for message in told:
+        control.tell(message)
+    for _ in range(MOST_UNSENT):
+        control.tell(LogLine("info", "again and again"))
+    assert watched == [True] and len(control._unsent) < 1000
+    heard: list[Message] = []
+    while len(heard) < len(told):
+        while len(control._unsent) < len(told) and is_readable(daemon):
+            heard.append(take(daemon.recv(1 << 16), FROM_DRIVER, state="up")[1])
+        control.send_rest()
+    assert heard[: len(told)] == told and not any(isinstance(each, LogLine) for each in heard)
+    assert watched == [True, False]
+    for _ in range(1000):
+        control.tell(MarkerSignalled(1))
+    daemon.close()
+    control.send_rest()
+    assert not control._unsent and watched == [True, False, True, False]
     control.close()
