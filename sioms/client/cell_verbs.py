@@ -348,7 +348,15 @@ class WorkcellVerbs(Session[M]):
 
     @verb
     async def reset(self, node: str = "") -> None:
-        """Clear the latched stop of the workcell or of a node. Nothing resumes by itself."""
+        """Clear the latched stop of the workcell or of a node, and faults. Nothing resumes by itself.
+
+        Args:
+            node: a node, '' = the workcell, with all its nodes.
+
+        Raises:
+            OSError: EAGAIN somebody else has stopped something since this was sent, or something has come into fault:
+                nothing has been cleared; look, and reset again.
+        """
         await self._ask("reset", verbs.Reset(node))
 
     @verb

@@ -152,7 +152,11 @@ class NodeVerbs(NodeCore[S]):
 
     @verb
     async def reset(self) -> None:
-        """Clear a latched stop or fault of this node; shown from the next tick on. Nothing resumes."""
+        """Clear a latched stop or fault of this node; shown from the next tick on. Nothing resumes.
+
+        Raises:
+            OSError: EAGAIN as of ``Workcell.reset``.
+        """
         await self._ask(Request.RESET)
 
     @verb
