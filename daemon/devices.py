@@ -66,8 +66,8 @@ class Owner(Protocol):
     def device_ticks(self, device: DriverProcess) -> None:
         """The driver ticks again."""
 
-    def stopped_of(self, device: str) -> list[list[Any]]:
-        """Return what of a device is stopped and must be so from its driver's start."""
+    def stopped_of(self, device: str) -> dict[str, Any]:
+        """Return options of a driver: what is ``stopped`` from its start, as of how many ``resets`` of the workcell."""
 
     def device_message(self, device: DriverProcess, message: Message) -> None:
         """The driver tells something."""
@@ -182,7 +182,7 @@ class DriverProcess:
             user=self.device.common.user,
             process=self.process,
             lease_s=self._lease_s,
-            stopped=self._owner.stopped_of(self.name),
+            **self._owner.stopped_of(self.name),
         )
         self._is_heard = True
         self._loop.watch(ours.fileno(), self._receive)  # first, because a spawn may be refused at once

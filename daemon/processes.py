@@ -135,9 +135,9 @@ class Processes:
             case _:
                 raise NotImplementedError(f"{type(message).__name__} is not served")
 
-    def stopped_of(self, device: str) -> list[list[Any]]:
-        """Return what of a device is stopped and must be so from its driver's start."""
-        return self._stops.stopped_of(device)
+    def stopped_of(self, device: str) -> dict[str, Any]:
+        """Return options of a driver: what is ``stopped`` from its start, as of how many ``resets`` of the workcell."""
+        return {"stopped": self._stops.stopped_of(device), "resets": self._cell.shared.latch.resets}
 
     # --- their beginning and end -----------------------------------------------------------------
 

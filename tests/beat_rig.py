@@ -162,6 +162,7 @@ class Device:
         options = {
             "stop_sources": [], "alarms": [], "daemon_lease_s": FOR_EVER_S, "phase": phase, "state_folder": "",
             "stopped": [],
+            "resets": 0,
         }  # fmt: skip
         fds = [theirs.detach(), *files]
         self._kept = [files[0], *files[3:]]

@@ -125,6 +125,7 @@ class World:
         settings = msgspec.convert(table, driver.Settings)
         options = {
             "stop_sources": [], "alarms": [], "daemon_lease_s": 1e6, "phase": 0.0, "state_folder": "", "stopped": [],
+            "resets": 0,
         }  # fmt: skip
         fds = [theirs.detach(), latch, request, taken, markers, journal, events]
         self.runtime = Runtime(driver, "dev", settings, 1, options, fds)

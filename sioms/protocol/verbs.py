@@ -329,8 +329,8 @@ class Supervise(Message, on=FROM_CLIENT, verb=ClientVerb.SUPERVISE, right=Right.
 class Reset(
     Message, on=FROM_CLIENT, verb=ClientVerb.RESET, right=Right.WRITE | Right.ADMINISTER, shown=True
 ):  # fmt: skip
-    """Clear the stop of a node, '' = of the workcell, and faults. Refused (EAGAIN) if anybody else has stopped something
-    of it since it was sent, or something has come into fault: nothing is cleared then.
+    """Clear the stop of a node, '' = of the workcell, and faults. Refused (EAGAIN) if anybody else has stopped
+    something of it since it was sent, or something has come into fault: nothing is cleared then.
     """
 
     node: Name

@@ -128,8 +128,7 @@ class Runtime:
         handles: dict[int, Handle] = {}
         self.stops = Stops(
             device, self.blocks, self.outputs, self.effects, self.waits, self.pages, handles, self.log, self.tell,
-            self.latch, request, StopJournal(fds[5]), options["stop_sources"],
-            self.journal,
+            self.latch, int(options["resets"]), request, StopJournal(fds[5]), options["stop_sources"], self.journal,
         )  # fmt: skip
         self.pages.before = self.stops.note_faults
         self.alarms = AlarmWatch(self.blocks, options["alarms"], self.tell, self.stops.stop_by_alarm)

@@ -83,6 +83,8 @@ class Stops:
         latch: the workcell's emergency-stop latch.
         request: file in which any client asks for an emergency stop.
         journal: where stops are noted before they are acknowledged, so that they outlive this process.
+        resets: how often the workcell had been reset when the daemon told what is stopped: one that comes while this
+            process is being forked is one for that, too.
         sources: inputs of this device that stop the workcell, each (block, channel, bit, active level).
         events: where stops, faults and resets are told to recorders.
 
@@ -101,7 +103,7 @@ class Stops:
     def __init__(
         self, device: str, blocks: Sequence[AnyBlock], outputs: Outputs, effects: Effects, waits: Waits, pages: Pages,
         handles: Mapping[int, Handle], log: Callable[[str, str], None], tell: Callable[[Message], None],
-        latch: Latch, request: StopRequest, journal: StopJournal, sources: Iterable[Sequence[int]],
+        latch: Latch, resets: int, request: StopRequest, journal: StopJournal, sources: Iterable[Sequence[int]],
         events: JournalWriter,
     ) -> None:  # fmt: skip
         self.stopped = False
@@ -120,7 +122,7 @@ class Stops:
         self._journal = journal
         self._events = events
         self._sources = [tuple(source) for source in sources]
-        self._seen = (0, latch.resets, request.mark)
+        self._seen = (0, resets, request.mark)
         self._ended_ns = latch.ended_stop_ns
         self._orders = latch.orders
 

@@ -19,6 +19,7 @@ from ownership_explorer import (
     settle,
     wander,
 )
+from ownership_fakes import ForkServer
 from ownership_promises import check_rest
 
 from sioms.daemon.devices import DriverProcess
@@ -215,6 +216,26 @@ def test_a_handle_is_closed_once_and_each_close_is_answered() -> None:
         cell.listen(0)
         assert list(cell.clients[0].take().values()) == ["done"]
         assert not cell._session(0).waits
+
+
+@pytest.mark.parametrize("device", [0, 1])
+def test_a_reset_of_the_workcell_that_comes_while_a_driver_is_forked_is_one_for_it(device: int) -> None:
+    with cells() as make, pytest.MonkeyPatch.context() as patch:
+        cell = make()
+        for action in [*begin("nobody owns anything"), ("stop_node", 1, device), ("hear", device)]:
+            cell.take(action)
+        for action in (("kill", device), ("bury", device, "process")):
+            cell.take(action)
+        spawn = ForkServer.spawn
+
+        def slow(*arguments: Any) -> None:
+            assert cell.take(("reset", 0)) == "done"
+            spawn(*arguments)
+
+        patch.setattr(ForkServer, "spawn", slow)
+        cell.take(("start", device))
+        cell.take(("tick", device))
+        assert not _is_stopped(cell, device)
 
 
 def test_no_lease_is_so_short_that_it_is_none() -> None:

@@ -33,8 +33,8 @@ class _Owner:
     def device_gone(self, device: DriverProcess, reason: str) -> None:
         self.gone.append(reason)
 
-    def stopped_of(self, device: str) -> list[Any]:
-        return []
+    def stopped_of(self, device: str) -> dict[str, Any]:
+        return {}
 
     def __getattr__(self, name: str) -> Any:
         raise AssertionError(f"{name} is not to be called")

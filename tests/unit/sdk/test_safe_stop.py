@@ -51,6 +51,7 @@ class Device:
             nothing,
             nothing,
             latch,
+            0,
             nothing,
             nothing,
             [],
