@@ -30,6 +30,8 @@ LATELY_S = 0.01
 #: ... or where it was changed all the same way, by this share of the axis's speed at least: then inertia says which
 #: flank of a play bears.
 PUSHED_S, PUSHED = 0.04, 0.1
+#: A block tells when a change began where it tells so much of it as blocks without noise would.
+TELLS = 0.05
 #: Blocks that are kept.
 KEPT = 400
 
@@ -207,7 +209,8 @@ class AxisWatch:
         self._judge(self.normal, block)
 
     def _judge(self, normal: Normal, block: Block) -> None:
-        found = [f for w in WINDOWS if len(self.blocks) >= w and (f := self._over(normal, w)).is_drift]
+        over = {w: f for w in WINDOWS if len(self.blocks) >= w and (f := self._over(normal, w)).is_drift}
+        found = list(over.values())
         self.latest = found[-1] if found else self._over(normal, min(len(self.blocks), WINDOWS[-1]))
         if not found:
             self._agreed.clear()
@@ -216,8 +219,13 @@ class AxisWatch:
                 self.drift = None
             return
         self._calm = 0
-        since = self._since(normal, found[-1])
-        after = [b for b in self.blocks if b.start_s > since][-WINDOWS[-1] :]  # in the first one it began
+        shown = next(iter(over))
+        since = self._since(normal, found[-1], shown)
+        if since is None:
+            after = list(self.blocks)[-shown:]
+            since = after[0].start_s
+        else:
+            after = [b for b in self.blocks if b.start_s > since][-WINDOWS[-1] :]  # in the first one it began
         if len(after) < WINDOWS[0]:
             return
         finding = self._of(normal, after)
@@ -255,22 +263,29 @@ class AxisWatch:
         now = estimate(blocks, normal.loads, normal.edges, normal.scatter, normal.noise, self.about.travel)
         return judge(normal, now, self.about.travel)
 
-    def _since(self, normal: Normal, finding: Finding) -> float:
-        """Return when a change began: from where on the blocks are nearer to it than to what is normal."""
-        weight = finding.change / (np.diag(normal.own) + 1e-300)
-        scale = float(finding.change @ weight)
-        sums, best, start = 0.0, 0.0, self.blocks[-1].start_s
-        for block in reversed(self.blocks):
+    def _since(self, normal: Normal, finding: Finding, shown: int) -> float | None:
+        """Return when a change began: from where on the blocks are nearer to it than to what is normal, by all that
+        each tells along it.
+
+        None where none of the last ``shown``, in which it shows, tells it by itself: the mass of the lightest move, of
+        a few.
+        """
+        size = np.sqrt(np.diag(normal.own))
+        size[size == 0.0] = 1.0  # what the axis has no reference for
+        change, own = finding.change / size, normal.own / np.outer(size, size)
+        most = float(change @ np.linalg.pinv(own, hermitian=True) @ change)
+        sums, best, start, told = 0.0, 0.0, self.blocks[-1].start_s, False
+        for number, block in enumerate(reversed(self.blocks)):
             one = estimate([block], normal.loads, normal.edges, normal.scatter, normal.noise, self.about.travel)
-            unsure = np.diag(one.noise) > 1e3 * np.abs(finding.change) ** 2 + 1e6 * np.diag(normal.own)
-            off = np.where(unsure, 0.0, one.theta - normal.theta)
-            along = float(np.where(unsure, 0.0, weight) @ off)
-            full = float(np.where(unsure, 0.0, weight) @ finding.change)
-            if full > 0.05 * scale:
+            weighed = np.linalg.solve(own + one.noise / np.outer(size, size), change)
+            full = float(weighed @ change)
+            if full > TELLS * most:
+                told = told or number < shown
+                along = float(weighed @ ((one.theta - normal.theta) / size))
                 sums += min(max(along / full, -1.0), 2.0) - 0.5
             if sums > best:
                 best, start = sums, block.start_s
-        return start
+        return start if told else None
 
     def relearn(self) -> None:
         """Forget what was normal, and learn anew."""

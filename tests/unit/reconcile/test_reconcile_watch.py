@@ -234,6 +234,22 @@ def test_one_edge_does_not_tell_a_shift_from_a_scale() -> None:
     assert judge(was, seen, 0.4).names != ("place",)
 
 
+def test_a_scale_is_told_though_each_block_passes_few_edges() -> None:
+    """No block tells anything of the reference by itself: its two crossings are too few."""
+    rng = np.random.default_rng(7)
+    speeds, both = [0.05, 0.1, 0.2, 0.3], (0.03, 0.08)
+    watch = AxisWatch(ABOUT)
+    watch.normal = learn(referred(blocks_at(rng, speeds * 5, 3.0), rng, both), 0.4, 1e-6)
+    found = []
+    for number, block in enumerate(blocks_at(rng, speeds * 6, 3.0)):
+        scale, at_s = 0.005 * (number >= 10), 100.0 * number
+        (told,) = referred([block], rng, (both[number % 2],), scale)
+        watch._take(replace(told, crossings=told.crossings[:2], start_s=at_s, end_s=at_s + 90.0))
+        found.append(watch.drift.names if watch.drift is not None else None)
+    assert len(found) > 20 and found[10] is None and ("scale",) in found, found
+    assert watch.drift is not None and 900.0 <= watch.drift.since_s <= 1300.0
+
+
 def crossings_of(speed_mps: float, rate: float, edges: list[float]) -> list[Crossing]:
     """Return what a watch keeps of edges [s] in a move of 1.2 s that speeds up and brakes within ``1 / rate``."""
     watch, n = AxisWatch(ABOUT, Settings()), 1200
