@@ -116,6 +116,11 @@ DEEP = 3.0
 """Standard errors, over all blocks, of a saving below the floor of a sensor. Where nothing is hidden none saved 0.03 of
 everything; fingers and force sensors of a fresh origin (0074).
 """
+BY_CHANCE = 3.0
+"""A view of a sensor is above its floor where it is so by this many standard deviations of the root mean square of so
+many rows of white noise, too: of 24 touches one in eight is above 1.15. A scatter that is told of few differences is
+allowed as many. Recordings of one short session with other noise: of 417 two were wrong before, of 274 none (1026).
+"""
 PAIRS = 3
 """Firsts of two effects at once, each with the best few seconds."""
 

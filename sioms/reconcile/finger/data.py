@@ -20,6 +20,7 @@ from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.finger.records import PARTS, Ramped, Touched, Untouched
 from sioms.reconcile.finger.terms import GROWING
 from sioms.reconcile.sensors.effect import SensorModel
+from sioms.reconcile.sensors.subject import by_chance
 
 VIEWS = ("touch", "course", "drift", "ramp", "cell", "strength")
 TOUCH, COURSE, DRIFT, RAMP, CELL, STRENGTH = range(6)
@@ -174,8 +175,8 @@ class FingerData:
         return u / size[:, None], size
 
     def scatter(self, predicted: Floats) -> float:
-        """Return by how much loads scatter from touch to touch, in units of ``load_share``, as strengths beside a
-        prediction tell; inf of few.
+        """Return by how much loads scatter from touch to touch at most, in units of ``load_share``, as strengths
+        beside a prediction tell; inf of few.
         """
         t = self.touched
         size = self._profile[1]
@@ -183,9 +184,10 @@ class FingerData:
         beside = self.miss(predicted)[-len(t) :] * np.sqrt(1.0 + unit**2) / unit
         same = [n + str(r) for n, r in zip(t.name, t.radius, strict=True)]
         runs = np.array([a == b == c for a, b, c in zip(same, same[1:], same[2:], strict=False)])
-        if np.count_nonzero(runs) < LEAST_RUNS:
+        count = int(np.count_nonzero(runs))
+        if count < LEAST_RUNS:
             return np.inf
-        seen = 1.4826 * np.median(np.abs(np.diff(beside, 2)[runs])) / np.sqrt(6.0)
+        seen = 1.4826 * np.median(np.abs(np.diff(beside, 2)[runs])) / np.sqrt(6.0) * by_chance(count)
         return float(np.sqrt(max(seen**2 - float(np.median(unit**-2.0)), 0.0)))
 
     @cached_property

@@ -26,7 +26,7 @@ from sioms.reconcile.finger.pressures import Floats
 from sioms.reconcile.finger.terms import TERMS
 from sioms.reconcile.refuse import hats, knots
 from sioms.reconcile.sensors.effect import SensorModel
-from sioms.reconcile.sensors.subject import Variable, View, by_chance, untouched
+from sioms.reconcile.sensors.subject import Variable, View, untouched
 from sioms.reconcile.sensors.verdict import Curve, Proposal
 from sioms.reconcile.thresholds import SHARPER
 from sioms.reconcile.verdict import NamedEffect
@@ -118,7 +118,7 @@ class FingerSubject:
         nothing new.
         """
         d = self.training.loaded(model)
-        seen = d.scatter(d.predict(model)) * by_chance(len(d.touched))
+        seen = d.scatter(d.predict(model))
         if seen > SHARPER and d.turned(self.training) < TURNED:
             return None
         share = self.whole.load_share

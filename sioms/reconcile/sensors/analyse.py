@@ -87,8 +87,8 @@ def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float
     first.
     """
     shares = smoother_shares(subject.training, found.fit, searcher.weights, subject.features())
-    ratios = searcher.ratios(found.fit.model)
-    view = max(shares, key=lambda v: (bool(ratios[v] > SENSOR.odd and shares[v] > UNEXPLAINED), shares[v]))
+    above = searcher.ratios(found.fit.model) > searcher.beyond_chance(SENSOR.odd)
+    view = max(shares, key=lambda v: (bool(above[v] and shares[v] > UNEXPLAINED), shares[v]))
     return shares[view], subject.training.views[view] if shares[view] > 0.0 else ""
 
 
@@ -132,12 +132,12 @@ def _unsteady(subject: Subject, searcher: Searcher, found: Found, names: Sequenc
 
 def _odd(searcher: Searcher, found: Found, share: float, view: str) -> bool:
     """Say whether something is left: a view above its floor that the state explains, or one far above it whatever
-    explains it.
+    explains it; further than chance brings so few rows.
     """
-    ratios = searcher.ratios(found.fit.model)
-    if view and share > UNEXPLAINED and ratios[searcher.data.views.index(view)] > SENSOR.odd:
+    ratios, views = searcher.ratios(found.fit.model), searcher.data.views
+    if view and share > UNEXPLAINED and (ratios > searcher.beyond_chance(SENSOR.odd))[views.index(view)]:
         return True
-    return bool(np.max(ratios) > QUIET)
+    return bool(np.any(ratios > searcher.beyond_chance(QUIET)))
 
 
 def _bursts(subject: Subject, searcher: Searcher, found: Found) -> float:

@@ -21,7 +21,7 @@ from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.fit import Data, Fit, on_one_footing, ratios, refit
 from sioms.reconcile.sensors.plausible import family, physical, termed, without
 from sioms.reconcile.sensors.screen import screen
-from sioms.reconcile.thresholds import DEEP, GAIN, NEARLY, SENSOR, SURE
+from sioms.reconcile.thresholds import BY_CHANCE, DEEP, GAIN, NEARLY, SENSOR, SURE
 
 Step = ladder.Step[SensorModel]
 Found = ladder.Found[Fit, SensorModel]
@@ -110,8 +110,16 @@ class Searcher(Search[SensorModel]):
         return self.fit(fit.model)
 
     def loud(self, fit: Fit) -> list[str]:
-        """Views that are above their floor."""
-        return [v for v, ratio in zip(self.data.views, self.ratios(fit.model), strict=True) if ratio > SENSOR.floor]
+        """Views that are above their floor, further than chance brings so few rows."""
+        above = self.ratios(fit.model) > self.beyond_chance(SENSOR.floor)
+        return [v for v, is_above in zip(self.data.views, above, strict=True) if is_above]
+
+    def beyond_chance(self, least: float) -> Array:
+        """Return for each view the multiple of its floor, at least ``least``, that chance brings no such count of
+        rows to.
+        """
+        rows = np.bincount(self.data.view, minlength=len(self.data.views))
+        return np.maximum(least, 1.0 + BY_CHANCE / np.sqrt(2.0 * np.maximum(rows, 1)))
 
     def ratio(self, fit: Fit) -> float:
         """Root mean square over all rows, in units of the floor."""

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sioms.reconcile.sensors.effect import Array, SensorModel
 from sioms.reconcile.sensors.fit import Data
 from sioms.reconcile.sensors.verdict import Curve, Proposal
+from sioms.reconcile.thresholds import BY_CHANCE
 from sioms.reconcile.verdict import NamedEffect
 
 
@@ -111,5 +112,9 @@ def untouched(count: int) -> NDArray[np.bool_]:
 
 
 def by_chance(count: int) -> float:
-    """Return how many times too low a scatter told of so many differences may be by chance."""
-    return float(1.0 + 2.0 / np.sqrt(count))
+    """Return how many times too low a scatter may be by chance that the median of so many second differences tells.
+
+    Of white noise the logarithm of such a scatter has a standard deviation of 1.41 over the root of their number, 12 to
+    300 of them.
+    """
+    return float(np.exp(BY_CHANCE * 1.41 / np.sqrt(count)))
