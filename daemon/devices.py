@@ -453,6 +453,8 @@ class DriverProcess:
     def note_fault(self, block: int, channel: int, at_ns: int, text: str) -> None:
         """Note since when a channel is in fault [ns, CLOCK_MONOTONIC], and why; 0: it is so no longer."""
         self._faults[block, channel] = (at_ns, text)
+        if not any(since_ns for since_ns, _ in self._faults.values()):
+            self.trouble = ""
 
     def hear(self) -> None:
         """Take what its driver has told until now, ahead of its turn."""

@@ -83,6 +83,14 @@ def test_a_reset_that_the_daemon_serves_late_is_refused_after_a_fault(
         wait_for(lambda: not axis.read().status[0] & AxisStatus.FAULT, "reset by who can have seen it")
 
 
+def test_the_status_tells_of_a_fault_until_it_is_reset_whoever_does(daemon: Daemon, cell: sioms.Workcell) -> None:
+    with cell.open("mod0.xaxis", "rw", timeout=5.0) as axis:
+        put_in_fault(axis)
+        wait_for(lambda: daemon.device("mod0")["trouble"], "told")
+        axis.reset()
+        wait_for(lambda: not daemon.device("mod0")["trouble"], "over")
+
+
 def test_what_one_client_sends_at_once_is_done_in_its_order(daemon: Daemon, cell: sioms.Workcell) -> None:
     """A stop and a reset of one session, in one go: who resets has sent the stop, and knows of it."""
     with daemon.cell("eager") as eager:
