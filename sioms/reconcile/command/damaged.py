@@ -46,7 +46,7 @@ class Answer:
     Attributes:
         outcome: "error", "traceback", or the verdict.
         names: that it gave, also beside a refusal.
-        left_out: whether records were, and the names are all that the others hide.
+        left_out: whether records were, and the names are all that the others hide, or among what they may hide.
     """
 
     kind: str
@@ -162,7 +162,8 @@ def _answer(kind: str, folder: Path, solve: Callable[[list[str]], int], hidden: 
     found: Mapping[str, Any] = json.loads((out / "verdict.json").read_text())
     names = tuple(dict.fromkeys([*found["effects"], *(n for a in found["alternatives"] for n in a)]))
     notes, outcome = found["notes"], str(found["verdict"])
-    whole = outcome in ("named", "none") and set(names) == set(hidden)
+    told = set(hidden) <= set(names) if outcome == "ambiguous" else set(names) == set(hidden)
+    whole = told and outcome != "unexplained"
     return Answer(kind, outcome, names, (notes or [""])[-1], seconds, whole and any(LEFT_OUT in n for n in notes))
 
 
