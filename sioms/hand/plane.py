@@ -33,6 +33,7 @@ from sioms.tactile.quality import Quality, State
 
 T = TypeVar("T")
 SHAPE = FingerShape()
+_FREE_STEPS = 2
 RUBBER_M = SHAPE.radius_m - SHAPE.core_m
 
 
@@ -50,6 +51,8 @@ class Rig:
         gains: of the controller.
         compiled: the estimator, see `sioms.tactile.estimator.Estimator`; the first takes some seconds.
         turned_rad: by which each finger is turned on its link, anti-clockwise.
+        free_m: from which clearance on a finger's frame is taken for one without contact, unmade, and the world goes
+            on by fewer steps while both are as free; infinite: never.
     """
 
     tick_s: float = 2.5e-3
@@ -63,6 +66,7 @@ class Rig:
     gains: Gains = field(default_factory=lambda: Gains(link_m=LINK_M))
     compiled: bool | None = None
     turned_rad: tuple[float, float] = (0.0, 0.0)
+    free_m: float = math.inf
 
 
 @lru_cache(maxsize=4)
@@ -150,7 +154,8 @@ class PlaneHand:
             turn = self.hand.joint_rates(now, rates)
             self.joints = [joint + tick_s * rate for joint, rate in zip(self.joints, turn, strict=True)]
         world.command([self.joints[:3], self.joints[3:]], tick_s)
-        world.advance(tick_s, self.rig.steps)
+        free = all(finger.normal == 0.0 and finger.gap_m > self.rig.free_m for finger in world.fingers)
+        world.advance(tick_s, min(self.rig.steps, _FREE_STEPS) if free else self.rig.steps)
         self._ticks += 1
         self.reading = self._read()
         if self.seen is not None:
@@ -192,6 +197,8 @@ class PlaneHand:
     def _feel(self, index: int) -> Felt:
         """Make a strain frame of a finger's contact and estimate what touches."""
         finger = self.world.fingers[index]
+        if finger.normal == 0.0 and finger.gap_m > self.rig.free_m:
+            return Felt(False)
         turned = finger.phi - self.rig.turned_rad[index]
         self._arrays[index].read(finger.normal, turned, finger.radius_m, self._raw)
         shape = self._estimate.frame(-0.01 * self._raw)

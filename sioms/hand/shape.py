@@ -55,6 +55,7 @@ class Parallel:
         direction: from contact 1 to contact 2 [rad].
         apart_m: distance of the contacts.
         deviation: standard deviation of the friction angles there [rad].
+        known: whether few touches are enough to know it: of an ellipse, or of two parallel sides.
     """
 
     x: float
@@ -62,6 +63,7 @@ class Parallel:
     direction: float
     apart_m: float
     deviation: float
+    known: bool = False
 
 
 class Shape:
@@ -108,6 +110,14 @@ class Shape:
             share = lean[i] / (lean[i] - lean[i + 1]) if lean[i] != lean[i + 1] else 0.5
             found.append(self._at(psi[i] + share * (psi[i + 1] - psi[i])))
         return sorted(found, key=lambda one: abs(math.remainder(one.direction - direction, math.tau)))
+
+    def outline(self) -> Array:
+        """Return points of it [m], anti-clockwise, shape (n, 2)."""
+        angles = np.radians(np.arange(0.0, 360.0, 2.0))
+        h, slope = _row(angles) @ self._c, _row(angles, 1) @ self._c
+        c, s = np.cos(angles), np.sin(angles)
+        points: Array = np.stack([h * c - slope * s, h * s + slope * c], axis=1) + self._middle
+        return points
 
     def _at(self, psi: float) -> Parallel:
         far, near = self._point(psi), self._point(psi + math.pi)
@@ -161,7 +171,7 @@ class Oval:
         for turn in (axis, axis + 0.5 * math.pi):
             psi = turn if math.cos(turn - direction) > 0.0 else turn + math.pi
             h = math.sqrt(self.p + self.q * math.cos(2.0 * psi) + self.r * math.sin(2.0 * psi))
-            found.append(Parallel(self.x, self.y, psi, 2.0 * h, 0.0))
+            found.append(Parallel(self.x, self.y, psi, 2.0 * h, 0.0, True))
         return sorted(found, key=lambda one: abs(math.remainder(one.direction - direction, math.tau)))
 
 
@@ -289,7 +299,7 @@ def _between_sides(touches: Sequence[Touch], direction: float) -> Parallel | Non
                 psi += math.pi
             x, y = (0.5 * (a + b) for a, b in zip(one.point, other.point, strict=True))
             across = (one.point[0] - other.point[0]) * math.cos(psi) + (one.point[1] - other.point[1]) * math.sin(psi)
-            return Parallel(x, y, psi, abs(across), 0.0)
+            return Parallel(x, y, psi, abs(across), 0.0, True)
     return None
 
 

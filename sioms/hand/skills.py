@@ -6,28 +6,27 @@ So it is deterministic, knows no clock, and runs alike on a simulated plane (`pl
     skills = Skills(hand, first_reading)
     found = plane.run(skills.hold_parallel(5.0))
 
-The states are OPEN, CLOSE, SENSE, CLASSIFY, REGRASP, ROLL, HOLD, FAULT. What goes wrong is a `Fault`: the hand opens or
-freezes, `events` says which and why, and `Failed` is raised. What will probably go wrong is said before, as an event.
+The states are OPEN, CLOSE, SENSE, CLASSIFY, FEEL, REGRASP, ROLL, HOLD, FAULT. What goes wrong is a `Fault`: the hand
+opens or freezes, `events` says which and why, and `Failed` is raised. What will probably go wrong is said before, as an
+event.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator
 
 from sioms.hand.contacts import FINGER_M, Grasp, Likeness, classify, friction_angle_deviation, grasp
+from sioms.hand.feeling import Feeling
 from sioms.hand.kinematics import Hand, Six
+from sioms.hand.motions import STILL
 from sioms.hand.regrasp import NEUTRAL, disk_radii, regrasp_disk, regrasp_rectangle
 from sioms.hand.rolling import correcting_law, friction_angle_rates, nearest_law
 from sioms.hand.shape import Touch, expected
-from sioms.hand.touch import Event, Failed, Fault, Manner, Reading, Sensed, Setpoint, State
-
-Ticks = Generator[Setpoint, Reading, None]
-STILL: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-_LETTING_GO_N = -0.1
+from sioms.hand.touch import Failed, Fault, Manner, Reading, Sensed, Setpoint, State
 
 
-class Skills:
+class Skills(Feeling):
     """Skills of one hand.  One at a time.
 
     Args:
@@ -44,30 +43,11 @@ class Skills:
     """
 
     def __init__(self, hand: Hand, first: Reading, manner: Manner | None = None) -> None:
-        self.hand, self.manner, self.now = hand, manner or Manner(), first
-        self.state, self.events = State.IDLE, list[Event]()
+        super().__init__(hand, first, manner)
         self.regrasps = self.rolls = 0
         self.sensed: Callable[[], None] | None = None
-        self._goal: list[float] = list(hand.forward(first.joints))
-        self._held, self._what = False, ""
-        self._missing = [0.0, 0.0]
-        self._warned = False
         self._past: list[Sensed] = []
         self._radii = [FINGER_M, FINGER_M]
-
-    def say(self, text: str, fault: Fault | None = None) -> None:
-        """Add an event."""
-        self.events.append(Event(self.now.time_s, self.state, text, fault))
-
-    def felt_force(self) -> float:
-        """Return the internal force that both fingers tell [N]: 0 unless both are touched."""
-        one, two = self.now.fingers
-        return 0.5 * (one.force + two.force) if one.touched and two.touched else 0.0
-
-    @property
-    def holds(self) -> bool:
-        """Return whether the object is meant to be between both fingers now."""
-        return self._held
 
     # what a user calls
 
@@ -133,9 +113,15 @@ class Skills:
             raise
 
     def _hold_parallel(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
-        found = yield from self._grasp()
+        try:
+            found = yield from self._grasp()
+        except Failed as failed:
+            if failed.fault not in (Fault.ARRAY_END, Fault.DOUBTFUL) or not self.manner.taps:
+                raise
+            found = yield from self._felt_anew(failed)
         while found.grasp.quality > self._good_enough(found):
-            if self.regrasps != 1 and self._can_roll(found) and found.force > 0.5 * self.manner.force_n:
+            sure = not self.manner.taps or self._by_class(found) is not None
+            if sure and self.regrasps != 1 and self._can_roll(found) and found.force > 0.5 * self.manner.force_n:
                 found = yield from self._roll()
                 continue
             if self.regrasps >= self.manner.regrasps:
@@ -196,14 +182,36 @@ class Skills:
     def _regrasp(self, found: Sensed) -> Generator[Setpoint, Reading, Sensed]:
         self.state = State.REGRASP
         self._past.append(found)
-        target = self.plan(found)
         self.regrasps += 1
         self.say(f"{found.likeness.value}-like, {_degrees(found.grasp)}: regrasp")
-        clear = 2.0 * self.manner.clearance_m
-        opened = max(target[3], self._goal[3]) + clear
+        target, sure = self._planned(found)
+        felt: Six | None = None
+        sure = sure or (self._around is not None and found.grasp.quality < _BESIDE_RAD)
+        if not sure and self.manner.taps:
+            yield from self._open()
+            felt = yield from self._feel_round(_touches(found))
+        target = felt or target
+        opened = max(target[3], self._goal[3]) + (0.0 if felt else 2.0 * self.manner.clearance_m)
         self._check_reach("regrasp object", (*target[:3], opened, *target[4:]))
-        yield from self._open()
+        if felt is None:
+            yield from self._open()
         yield from self._move((*target[:3], opened, *target[4:]))
+        yield from self._close()
+        return (yield from self._squeeze())
+
+    def _felt_anew(self, failed: Failed) -> Generator[Setpoint, Reading, Sensed]:
+        """Let go of what an array does not cover, feel round it, grasp it where it is parallel.
+
+        Raises:
+            Failed: as before, where that was not found.
+        """
+        self.say(f"{failed}: regrasp", failed.fault)
+        self.regrasps += 1
+        yield from self._open()
+        target = yield from self._feel_round([])
+        if target is None:
+            raise failed
+        yield from self._move(target)
         yield from self._close()
         return (yield from self._squeeze())
 
@@ -211,6 +219,10 @@ class Skills:
         """Return where the hand goes for a parallel grasp: by the law of the class where both curvatures agree with it,
         else by the arcs that touch.
         """
+        return self._planned(found)[0]
+
+    def _by_class(self, found: Sensed) -> Six | None:
+        """Return the parallel grasp of a disk or a rectangle; None where curvatures or angles tell that it is none."""
         held = found.grasp
         radius = 0.5 * sum(disk_radii(held))
         for likeness, bend in ((Likeness.DISK, 1.0 / radius), (Likeness.RECTANGLE, 0.0)):
@@ -221,6 +233,13 @@ class Skills:
             twist = held.eta1 + held.eta2 if likeness is Likeness.DISK else held.eta1 - held.eta2
             if agrees and found.likeness is likeness and abs(twist) < 4.0 * found.deviation + math.radians(1.0):
                 return regrasp_disk(held, radius) if likeness is Likeness.DISK else regrasp_rectangle(held)
+        return None
+
+    def _planned(self, found: Sensed) -> tuple[Six, bool]:
+        """Return where the hand goes for a parallel grasp, and whether what was felt is enough to know it."""
+        held = found.grasp
+        if (target := self._by_class(found)) is not None:
+            return target, True
         known = [touch for sensed in self._past for touch in _touches(sensed)]
         low, high = self.manner.opening
         for one in expected(known, held):
@@ -230,8 +249,9 @@ class Skills:
             d = one.apart_m + 2.0 * FINGER_M
             turned = abs(math.remainder(one.direction - held.direction, math.tau))
             if turned < _MOST_TURN and shift < 0.75 * held.apart_m and low < d < high - 2e-2:
-                return one.x, one.y, one.direction, d, NEUTRAL, NEUTRAL
-        return regrasp_disk(held, radius) if found.likeness is Likeness.DISK else regrasp_rectangle(held)
+                return (one.x, one.y, one.direction, d, NEUTRAL, NEUTRAL), one.known
+        radius = 0.5 * sum(disk_radii(held))
+        return (regrasp_disk(held, radius) if found.likeness is Likeness.DISK else regrasp_rectangle(held)), False
 
     def _can_roll(self, found: Sensed) -> bool:
         """Return whether rolling leads to a parallel grasp before an array ends, as far as the curvatures tell: each
@@ -357,218 +377,16 @@ class Skills:
             self.sensed()
         return found
 
-    # motions
-
-    def _close(self) -> Ticks:
-        """Close until both fingers are touched; the finger that is touched first waits for the other."""
-        self.state, self._held = State.CLOSE, False
-        manner, speed = self.manner, self.manner.closing
-        self._goal = list(self.hand.forward(self.now.joints)[:4]) + self._goal[4:]
-        pressed_s, since = 0.0, [math.inf, math.inf]  # since when each finger has felt nothing
-        latest_s = self.now.time_s + manner.close_s
-        while pressed_s < _MET_S:
-            if self.now.time_s > latest_s:
-                free = [f"finger {i}" for i, gone_s in enumerate(since, 1) if gone_s >= _MET_S] or ["both, in turns"]
-                raise Failed(
-                    Fault.NOTHING_THERE,
-                    f"grasp object: not between both fingers after {manner.close_s:g} s of closing, "
-                    f"{' and '.join(free)} not touched; want an object that both fingers press on",
-                )
-            one, two = (gone_s < _MET_S for gone_s in since)
-            before_s, both = self.now.time_s, one and two
-            drift = 0.0 if one == two else (-0.5 if one else 0.5) * speed
-            pressed = all(finger.touched for finger in self.now.fingers)
-            shut = 0.0 if pressed else -_CREEP * speed if both else -speed
-            u, v = math.cos(self._goal[2]), math.sin(self._goal[2])
-            yield from self._follow((drift * u, drift * v, 0.0, shut, 0.0, 0.0), manner.light_n if both else 0.0)
-            gone_s, apart = self.now.time_s - before_s, self.hand.forward(self.now.joints)[3]
-            # light fingers bounce: the goal does not run away from where they are
-            self._goal[3] = apart if both else max(self._goal[3], apart - _AHEAD_M)
-            pressed_s = (pressed_s + gone_s * pressed) if both else 0.0
-            since = [
-                0.0 if finger.touched else past + gone_s for finger, past in zip(self.now.fingers, since, strict=True)
-            ]
-            if self._goal[3] < manner.opening[0] and not both:
-                raise Failed(
-                    Fault.TOO_SMALL if one or two else Fault.NOTHING_THERE,
-                    f"grasp object: {'one finger is' if one or two else 'nothing is'} touched with the fingers' "
-                    f"centres {1e3 * self._goal[3]:.0f} mm apart; want an object between them, wider than "
-                    f"{1e3 * (manner.opening[0] - 2.0 * FINGER_M):.0f} mm",
-                )
-        self._held = True
-        self._missing = [0.0, 0.0]
-
-    def _settle(self, force: float, time_s: float) -> Ticks:
-        """Wait until the force is within a tenth of what is wanted, and then for a time [s]; five seconds at most."""
-        since, start = self.now.time_s, self.now.time_s
-        while self.now.time_s - since < time_s and self.now.time_s - start < 5.0:
-            yield from self._tick((0.0, 0.0), force)
-            if self._seen().quality > self.manner.squeeze_rad and force > self.manner.light_n:
-                return
-            if abs(self.felt_force() - force) > 0.1 * force:
-                since = self.now.time_s
-
-    def _open(self) -> Ticks:
-        """Let go and leave the object by the clearance."""
-        self.state, self._held = State.OPEN, False
-        at = self.hand.forward(self.now.joints)
-        self._goal = [*at[:4], *self._goal[4:]]
-        end = at[3] + 2.0 * self.manner.clearance_m
-        start = self.now.time_s
-        while self.felt_force() > 0.5 * self.manner.light_n and self.now.time_s - start < 2.0:
-            yield from self._follow(STILL, 0.25 * self.manner.light_n)
-        yield from self._let_go()
-        while self._goal[3] < end:
-            yield from self._follow((0.0, 0.0, 0.0, self.manner.moving, 0.0, 0.0), _LETTING_GO_N)
-
-    def _let_go(self) -> Ticks:
-        """Open until nothing is touched, two seconds at most."""
-        start = self.now.time_s
-        while any(finger.touched for finger in self.now.fingers) and self.now.time_s - start < 2.0:
-            self._goal[3] = max(self._goal[3], self.hand.forward(self.now.joints)[3] + 1e-3)
-            yield from self._follow(STILL, _LETTING_GO_N)
-
-    def _move(self, target: Sequence[float]) -> Ticks:
-        """Go to hand coordinates in free space, evenly; what is touched on the way makes the hand open further."""
-        start, manner = list(self._goal), self.manner
-        way = [to - at for to, at in zip(target, start, strict=True)]
-        way[2] = math.remainder(way[2], math.tau)
-        time_s = max(
-            math.hypot(way[0], way[1]) / manner.moving, abs(way[3]) / manner.moving,
-            *(abs(way[i]) / manner.turning for i in (2, 4, 5)), 1e-3,
-        ) * 1.5  # fmt: skip
-        begin, more = self.now.time_s, 0.0
-        while (gone := (self.now.time_s - begin) / time_s) < 1.0:
-            share, pace = gone * gone * (3.0 - 2.0 * gone), 6.0 * gone * (1.0 - gone) / time_s
-            if any(finger.touched for finger in self.now.fingers):
-                more += 2e-4
-                self._check_reach("move to object", (*start[:3], start[3] + more, *start[4:]))
-            self._goal = [at + share * by for at, by in zip(start, way, strict=True)]
-            self._goal[3] += more
-            yield from self._follow([pace * by for by in way], _LETTING_GO_N, advance=False)
-        for _ in range(_ARRIVE):
-            yield from self._follow(STILL, _LETTING_GO_N)
-
-    # one tick
-
-    def _tick(self, rolling: tuple[float, float], force: float | None = None) -> Ticks:
-        """Hold on for a tick while the fingers roll at these rates [rad/s]."""
-        wanted = self.manner.force_n if force is None else force
-        yield from self._follow((0.0, 0.0, 0.0, 0.0, *rolling), wanted)
-
-    def _follow(self, along: Sequence[float], force: float, advance: bool = True) -> Ticks:
-        last_s = self.now.time_s
-        goal: Six = tuple(self._goal)  # type: ignore[assignment]
-        rates: Six = tuple(along)  # type: ignore[assignment]
-        self.now = yield Setpoint(goal, rates, force)
-        gone_s = self.now.time_s - last_s
-        if advance:
-            self._goal = [at + gone_s * rate for at, rate in zip(self._goal, along, strict=True)]
-        self._watch(gone_s)
-
-    def _seen(self) -> Grasp:
-        """Return the grasp of this tick; of a finger without contact its last place counts."""
-        one, two = (finger.phi if math.isfinite(finger.phi) else NEUTRAL for finger in self.now.fingers)
-        return grasp(self.now.joints, (one, two), self.hand)
-
-    # what is watched
-
-    def _watch(self, gone_s: float) -> None:
-        if self.state is State.FAULT:  # it is letting go, of whatever
-            return
-        manner = self.manner
-        what = self._what
-        for i, (finger, age_s) in enumerate(zip(self.now.fingers, self.now.ages_s, strict=True)):
-            unknown = not math.isfinite(finger.force)
-            if not age_s <= manner.stale_s or finger.touched is None or unknown:
-                why = "its force is not known" if unknown else "it is blind"
-                if not age_s <= manner.stale_s:
-                    why = f"its frame is {age_s:.2f} s old"
-                raise Failed(
-                    Fault.STALE,
-                    f"{what}: finger {i + 1} cannot be relied on: {why}; want a frame every {manner.stale_s:g} s",
-                )
-            if finger.force > manner.most_n:
-                raise Failed(
-                    Fault.OVERLOAD,
-                    f"{what}: finger {i + 1} bears {finger.force:.1f} N; want at most {manner.most_n:g} N",
-                )
-            self._missing[i] = 0.0 if finger.touched else self._missing[i] + gone_s
-            if self._held and self._missing[i] > manner.lost_s:
-                raise Failed(
-                    Fault.LOST_CONTACT,
-                    f"{what}: finger {i + 1} has felt nothing for {self._missing[i]:.2f} s; the other may still touch",
-                )
-        if self._held and self.state is not State.CLOSE:
-            self._watch_arrays(what)
-
-    def _watch_arrays(self, what: str) -> None:
-        low, high = self.manner.arc
-        margin = _END_RAD
-        for i, finger in enumerate(self.now.fingers):
-            if finger.touched and not low - margin < finger.phi < high + margin:
-                raise Failed(
-                    Fault.ARRAY_END,
-                    f"{what}: finger {i + 1} is touched at {math.degrees(finger.phi):.0f} degrees; its array ends at "
-                    f"{math.degrees(low - margin):.0f} and {math.degrees(high + margin):.0f} degrees",
-                )
-
-    def _watch_cone(self, eta: float) -> None:
-        """Warn of friction angles that grow; let go beyond the cone."""
-        manner = self.manner
-        if eta > math.atan(manner.friction):
-            raise Failed(
-                Fault.CONE,
-                f"hold object: a friction angle of {math.degrees(eta):.1f} degrees; want less than "
-                f"{math.degrees(math.atan(manner.friction)):.1f}, or it slides",
-            )
-        if eta > manner.light_rad and not self._warned:
-            self.say(f"near the friction cone: {math.degrees(eta):.1f} degrees", Fault.CONE)
-        self._warned = eta > manner.light_rad
-
-    def _check_sensors(self, what: str) -> None:
-        for i, calibrated in enumerate(self.now.calibrated):
-            if not calibrated:
-                raise Failed(
-                    Fault.UNCALIBRATED,
-                    f"{what}: finger {i + 1} has no calibration; want one for each finger (sioms tactile calibrate)",
-                )
-        self._watch(0.0)
-
-    def _check_reach(self, what: str, coordinates: Sequence[float]) -> None:
-        """Refuse coordinates that the modules do not reach."""
-        low, high = self.manner.opening
-        d = coordinates[3]
-        if not math.isfinite(sum(coordinates)) or d < self.hand.least_m:
-            raise Failed(Fault.SINGULAR, f"{what}: the fingers' centres would coincide; want d of {1e3 * low:.0f} mm")
-        if d > high:
-            raise Failed(
-                Fault.TOO_LARGE, f"{what}: it needs the hand open to {1e3 * d:.0f} mm; want at most {1e3 * high:.0f} mm"
-            )
-        x1, y1, _, x2, y2, _ = self.hand.inverse(coordinates)
-        left, right, bottom, top = self.manner.reach
-        for i, (x, y) in enumerate(((x1, y1), (x2, y2))):
-            if not (left <= x <= right and bottom <= y <= top):
-                raise Failed(
-                    Fault.OUT_OF_REACH,
-                    f"{what}: module {i + 1} would have to be at {1e3 * x:.0f}, {1e3 * y:.0f} mm; its platen reaches "
-                    f"from {1e3 * left:.0f}, {1e3 * bottom:.0f} to {1e3 * right:.0f}, {1e3 * top:.0f} mm",
-                )
-
 
 _PLACE_RAD = math.radians(0.02)  # what averaging does not take from a place: of the axes' and the array's own
 _HOLLOW = 15.0  # 1/m
-_END_RAD = math.radians(6.0)
+_BESIDE_RAD = math.radians(4.0)  # so near a parallel grasp that was felt the arcs that touch tell it
 _MOST_TURN = math.radians(50.0)
 _SPARE = 1.2  # of an array's arc, where rolling is begun
-_ARRIVE = 40  # ticks
 _LIGHT_N = 0.5  # below which curvatures are felt badly
 _SHARP, _FLAT = 90.0, 0.1  # 1/m
 _CORNER_M = 2e-3
 _LIGHTLY = 10  # times the frames, where it is only felt lightly
-_CREEP = 0.1  # of the closing speed, while both fingers have met it and press too lightly to be felt
-_MET_S = 0.1  # how long a finger that bounces counts as touched
-_AHEAD_M = 1e-3
 
 
 def _touches(found: Sensed) -> list[Touch]:

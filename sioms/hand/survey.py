@@ -21,8 +21,9 @@ import numpy as np
 
 from sioms.hand.contacts import FINGER_M
 from sioms.hand.kinematics import Hand
+from sioms.hand.motions import STILL
 from sioms.hand.regrasp import NEUTRAL
-from sioms.hand.skills import STILL, Skills
+from sioms.hand.skills import Skills
 from sioms.hand.touch import Failed, Manner, Reading, Setpoint, State
 
 OTHER, DISK, BAR = 0, 1, 2

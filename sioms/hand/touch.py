@@ -79,6 +79,7 @@ _MANNERS = {
     "roll_s": (1e-3, 1e5), "clearance_m": (1e-4, 0.1), "tolerance_rad": (1e-6, 1.0), "held_rad": (0.0, 1.0),
     "frames": (1, 100_000), "light_rad": (0.0, math.pi), "squeeze_rad": (0.0, math.pi), "friction": (1e-3, 100.0),
     "most_n": (1e-3, 1e3), "lost_s": (1e-3, 100.0), "stale_s": (1e-3, 100.0), "regrasps": (0, 1000),
+    "tap_n": (1e-3, 1e3), "taps": (0, 1000),
 }  # fmt: skip
 """Bounds of how a skill may be done."""
 
@@ -91,6 +92,7 @@ class State(Enum):
     CLOSE = "close"
     SENSE = "sense"
     CLASSIFY = "classify"
+    FEEL = "feel"
     REGRASP = "regrasp"
     ROLL = "roll"
     HOLD = "hold"
@@ -175,6 +177,8 @@ class Manner:
         most_n: force beyond which the hand lets go [N].
         lost_s, stale_s: how long a contact may be missing, a frame old [s].
         regrasps: at most so many.
+        tap_n: with which one finger touches what lies on the platen [N]; less than moves it.
+        taps: pairs of such touches before a regrasp, at most; 0 for none.
         smallest: roll towards the smallest diameter, as the source does; else towards the nearest parallel grasp.
         opening: least and largest d [m].
         reach: of the carriages, x and y from and to [m].
@@ -201,6 +205,8 @@ class Manner:
     lost_s: float = 0.15
     stale_s: float = 0.1
     regrasps: int = 4
+    tap_n: float = 0.04
+    taps: int = 14
     smallest: bool = False
     opening: tuple[float, float] = (2.0 * FINGER_M + 5e-3, 0.2)
     reach: tuple[float, float, float, float] = (-0.4, 0.4, -0.6, 0.6)

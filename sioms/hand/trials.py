@@ -25,7 +25,9 @@ FAMILIES = (*SHAPES, "hull")
 SURE = LEAST_FRICTION
 """Coefficient from which on nothing may be dropped."""
 WITHIN_RAD = math.radians(1.0)
+RIG = Rig(free_m=1e-3)
 _MOST_TRIES = 200
+_MOST_S = 400.0  # of its time
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,7 +149,7 @@ def _hull(half_x_m: float, half_y_m: float, random: np.random.Generator) -> Outl
         return polygon(corners)
 
 
-def carry_out(subject: Subject, hold_s: float = 2.0, rig: Rig = Rig(), manner: Manner = Manner()) -> Outcome:  # noqa: B008
+def carry_out(subject: Subject, hold_s: float = 2.0, rig: Rig = RIG, manner: Manner = Manner()) -> Outcome:  # noqa: B008
     """Grasp an object, bring it into a parallel grasp and hold it; return what became of it."""
     hand = PlaneHand(Body(subject.outline), subject.pose, rig, Mount(friction=subject.friction), seed=subject.number)
     skills = Skills(hand.hand, hand.reading, manner)
@@ -159,7 +161,7 @@ def carry_out(subject: Subject, hold_s: float = 2.0, rig: Rig = Rig(), manner: M
         nonlocal lost_s, closed_s
         if skills.state is State.CLOSE:
             closed_s = hand.world.time_s
-        if hand.is_held() or skills.state in (State.CLOSE, State.OPEN, State.REGRASP):
+        if hand.is_held() or skills.state in (State.CLOSE, State.OPEN, State.FEEL, State.REGRASP):
             lost_s = math.inf
         elif skills.holds and lost_s == math.inf:
             lost_s = hand.world.time_s
@@ -174,7 +176,7 @@ def carry_out(subject: Subject, hold_s: float = 2.0, rig: Rig = Rig(), manner: M
     hand.seen, skills.sensed = look, sensed
     fault = None
     try:
-        hand.run(skills.hold_parallel(hold_s))
+        hand.run(skills.hold_parallel(hold_s), _MOST_S)
     except Failed as failed:
         fault = failed.fault
     except TimeoutError:

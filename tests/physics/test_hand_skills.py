@@ -48,6 +48,31 @@ def test_what_is_nearly_parallel_is_held_and_corrected_there() -> None:
     assert (skills.regrasps, skills.rolls) == (0, 0) and hand.truth().quality < 0.2 * DEG
 
 
+def test_a_polygon_is_felt_round_without_being_moved_and_held_parallel_by_one_regrasp() -> None:
+    subject = draw(2, 7201, ["polygon"])
+    hand = PlaneHand(Body(subject.outline), subject.pose, Rig(free_m=1e-3), Mount(friction=2.0), seed=3)
+    skills = Skills(hand.hand, hand.reading)
+    poses: list[list[float]] = []
+    most: list[float] = []
+
+    def look(hand: PlaneHand, _: Setpoint) -> None:
+        if skills.state is State.FEEL:
+            poses.append(list(hand.world.pose))
+            one, two = hand.world.fingers
+            most.append(max(one.normal, two.normal))
+            assert min(one.normal, two.normal) == 0.0 and not skills.holds
+
+    hand.seen = look
+    counted: list[float] = []
+    skills.sensed = lambda: counted.append(hand.truth().quality)
+    hand.run(skills.hold_parallel(1.0), 300.0)
+    assert skills.regrasps in (1, 2) and skills.rolls == 0 and skills.taps >= 4
+    assert counted[0] > 5 * DEG and counted[-2] < 1 * DEG and hand.is_held()
+    moved = [max(row) - min(row) for row in zip(*poses, strict=True)]
+    assert max(moved[:2]) < 0.3 * MM and moved[2] < 1.5 * DEG
+    assert 0.02 < max(most) < 0.3
+
+
 def test_a_disk_is_rolled_until_it_is_held_parallel() -> None:
     hand, skills = plane(disk(20 * MM), (3 * MM, 6 * MM, 0.0))
     first = hand.run(skills.grasp())

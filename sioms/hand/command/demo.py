@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     from sioms.hand.command.frames import Film
     from sioms.hand.plane import PlaneHand
     from sioms.hand.skills import Skills
-    from sioms.hand.touch import Failed
+    from sioms.hand.touch import Failed, Manner
     from sioms.hand.trials import draw
     from sioms.plant.planar import Body, Mount
 
@@ -50,7 +50,7 @@ def run(args: argparse.Namespace) -> int:
         raise ValueError(f"take object {args.object}: want 0 or more")
     subject = draw(args.object)
     hand = PlaneHand(Body(subject.outline), subject.pose, mount=Mount(friction=subject.friction), seed=args.object)
-    skills = Skills(hand.hand, hand.reading)
+    skills = Skills(hand.hand, hand.reading, Manner(taps=0))  # so that there is something left to roll
     points = [(float(x), float(y)) for x, y in subject.outline.points]
     film, screen = Film(skills, FILM_HZ), None if args.quiet else Screen(points)
 
@@ -115,7 +115,7 @@ def _knock(hand: PlaneHand, skills: Skills) -> None:
 
 
 def _frozen(skills: Skills) -> Setpoint:
-    from sioms.hand.skills import STILL
+    from sioms.hand.motions import STILL
     from sioms.hand.touch import Setpoint
 
     return Setpoint(skills.hand.forward(skills.now.joints), STILL, 0.0, frozen=True)

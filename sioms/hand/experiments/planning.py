@@ -12,9 +12,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sioms.hand.around import Around
 from sioms.hand.contacts import FINGER_M, Grasp, classify, grasp_of
+from sioms.hand.feeling import FITS_RAD
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.regrasp import NEUTRAL
+from sioms.hand.shape import Touch
 from sioms.hand.skills import Skills
 from sioms.hand.touch import Felt, Manner, Reading, Sensed
 from sioms.hand.trials import Subject
@@ -22,6 +25,7 @@ from sioms.plant.planar import Body, Mount, World
 
 _PLACE = math.radians(0.03)  # deviation of an average place
 _LIGHT_BEND, _BEND = 4.0, 0.6  # of a flat contact's curvature, touched lightly and squeezed [1/m]
+_TAP_N, _TAP_RAD, _TAP_M = 0.05, math.radians(0.15), 1e-5  # of one finger alone: force, place and axes
 _FAR_M, _NEAR_M = 0.15, -0.1
 _HALVINGS, _INSTANT_S = 22, 1e-9
 
@@ -69,6 +73,36 @@ def plan_regrasps(subject: Subject, seed: int = 0, steps: int = 2, manner: Manne
     return Planned(tuple(etas), rolls)
 
 
+def feel_round(subject: Subject, pairs: int, seed: int = 0) -> tuple[float, int]:
+    """Touch an object that does not move with one finger at a time, as `Skills` does between grasps.
+
+    Return the true max |eta| [rad] where it would be grasped, and how many pairs of touches that took.
+
+    Args:
+        subject: of a draw.
+        pairs: at most so many after the first.
+        seed: of the noise.
+    """
+    object_, around = _Still(subject, seed), Around()
+    x = y = psi = 0.0
+    for many in range(pairs + 1):
+        pair = object_.tap(x, y, psi)
+        if pair is None:
+            around.missed(x, y, psi)
+        else:
+            true, held = pair
+            if held.quality < FITS_RAD * (1.0 + 0.1 * many) or many == pairs:
+                return true.quality, many
+            contacts = ((held.contact1, held.normal1), (held.contact2, held.normal2))
+            around.add([Touch(at, normal + math.pi, math.inf, math.inf) for at, normal in contacts], x, y, psi)
+            psi = held.direction
+        one = around.next(psi)
+        if one is None:
+            break
+        x, y, psi = one.x, one.y, one.direction
+    return math.inf, pairs
+
+
 class _Planner(Skills):
     """Plans without moving."""
 
@@ -96,6 +130,18 @@ class _Still:
         if found is None or found[0].quality > manner.squeeze_rad:
             return found
         return self._close(x, y, psi, manner.force_n, _BEND)
+
+    def tap(self, x: float, y: float, psi: float) -> tuple[Grasp, Grasp] | None:
+        """Touch with both fingers, one after the other; return the grasp truly and as it is felt."""
+        for index, sign in enumerate((-1.0, 1.0)):
+            if not self._press(index, x, y, psi, sign, _TAP_N):
+                return None
+        one, two = self._world.fingers
+        true = grasp_of(one.centre, two.centre, one.phi, two.phi)
+        turn, place = self._random.normal(0.0, _TAP_RAD, 2), self._random.normal(0.0, _TAP_M, 4)
+        first = one.centre[0] + place[0], one.centre[1] + place[1]
+        second = two.centre[0] + place[2], two.centre[1] + place[3]
+        return true, grasp_of(first, second, one.phi + turn[0], two.phi + turn[1])
 
     def _close(self, x: float, y: float, psi: float, force: float, spread: float) -> tuple[Grasp, Sensed] | None:
         for index, sign in enumerate((-1.0, 1.0)):

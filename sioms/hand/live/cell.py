@@ -43,8 +43,9 @@ _NEW_S = 1.0
 _FIRST_S = 10.0
 _WATCHED = 40
 _ENOUGH = 0.5
-MANNER = Manner(light_n=0.4)
-"""Light touches are a little firmer than on the plane: the platen holds an object against one finger with 0.2 N."""
+MANNER = Manner(light_n=0.4, taps=0)
+"""Light touches are a little firmer than on the plane, and no object is felt round: a live finger tells a contact from
+0.14 N on, and the platen holds an object against one finger with 0.2 N."""
 _BLIND = Felt(None)
 
 

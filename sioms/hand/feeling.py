@@ -1,0 +1,174 @@
+"""Feel round an object that lies on the platen: touch it with one finger at a time, too lightly to move it.
+
+Nothing is held meanwhile. Every pair of touches, one of each finger along one line, is made where all touches before
+it let expect a parallel grasp (`around.Around`), until both normals lie along the line: there the hand closes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Sequence
+
+from sioms.hand.around import Around
+from sioms.hand.contacts import FINGER_M, grasp_of
+from sioms.hand.kinematics import Six
+from sioms.hand.motions import LETTING_GO_N, Motions
+from sioms.hand.regrasp import NEUTRAL
+from sioms.hand.shape import Parallel, Touch
+from sioms.hand.touch import Reading, Setpoint, State
+
+
+class Feeling(Motions):
+    """Feel round objects with one hand.  One at a time.
+
+    Attributes:
+        taps: how many touches of one finger it has made.
+    """
+
+    taps = 0
+    _around: Around | None = None
+
+    def _feel_round(self, known: Sequence[Touch]) -> Generator[Setpoint, Reading, Six | None]:
+        """Return where it would be held parallel, the hand being open there; None where that was not found.
+
+        Args:
+            known: touches of the grasp before, made where the hand is; none: it begins there.
+        """
+        before, self.state = self.state, State.FEEL
+        x, y, direction, d, *_ = self._goal
+        around, begun = Around(), self.taps
+        first = None if known else Parallel(x, y, direction, d - 2.0 * FINGER_M, math.inf)
+        if known:
+            around.add(known, x, y, direction)
+        opened = max(self._goal[3], self._free_m)
+        yield from self._move((x, y, direction, opened, *self._goal[4:]))
+        best, found = _NEARLY_RAD, None
+        for many in range(self.manner.taps):
+            one, first = first or around.next(direction), None
+            if one is None:
+                break
+            target: Six = (one.x, one.y, one.direction, opened, _MIDDLE_RAD, _MIDDLE_RAD)
+            if not self._reaches(target):
+                break
+            if (yield from self._move(target)):  # it was in the way, and may lie elsewhere now
+                around, best, found = Around(), _NEARLY_RAD, None
+                opened = min(opened + 2.0 * self.manner.clearance_m, self.manner.opening[1] - 1e-3)
+            touches: list[Touch] = []
+            for index in (0, 1):
+                touch = yield from self._tap(index, 0.5 * one.apart_m + FINGER_M)
+                touches += [touch] if touch is not None else []
+            if len(touches) < 2:
+                around.missed(one.x, one.y, one.direction)
+            elif (off := _held_by(touches)[0]) < best:
+                best, found = off, _held_by(touches)[1]
+            around.add(touches, one.x, one.y, one.direction)
+            if best < FITS_RAD * (1.0 + 0.1 * many):
+                break
+        self._around = around
+        self.say(f"felt {self.taps - begun} places round it: {'a' if found else 'no'} parallel grasp")
+        self.state = before
+        return None if found is None else (*found, self._goal[3], NEUTRAL, NEUTRAL)
+
+    def _tap(self, index: int, near_m: float) -> Generator[Setpoint, Reading, Touch | None]:
+        """Touch the object with one finger and leave it again; return what it felt, None where there is nothing.
+
+        Args:
+            index: of the finger.
+            near_m: how far from the middle the finger is expected to meet it [m].
+        """
+        manner, side = self.manner, 0.5 - index
+        u, v = math.cos(self._goal[2]), math.sin(self._goal[2])
+        start, way, force = list(self._goal), 0.0, 0.0
+        rested_s, blind_s, met = 0.0, 0.0, False
+        most = 0.5 * start[3] + FINGER_M
+        touch: Touch | None = None
+        while way < most and blind_s < _BLIND_S:
+            finger, before_s = self.now.fingers[index], self.now.time_s
+            far = 0.5 * start[3] - way > near_m + _NEAR_M
+            rate = manner.moving if far else _GENTLE * manner.closing
+            along: Six = (side * rate * u, side * rate * v, 0.0, -rate, 0.0, 0.0)
+            met = met or bool(finger.touched)
+            if met:
+                self._yield()
+                rate = 0.0 if rested_s > 0.0 or force > manner.tap_n else _CREEP * manner.closing
+                along = self._by_link(index, rate)
+            yield from self._follow(along, 0.0)
+            gone_s = self.now.time_s - before_s
+            way += rate * gone_s
+            force += min(gone_s / _FILTER_S, 1.0) * (self.now.fingers[index].force - force)
+            blind_s = blind_s + gone_s if finger.touched is None else 0.0
+            rested_s = rested_s + gone_s if rate == 0.0 else 0.0
+            if rested_s > _RESTED_S:
+                touch = yield from self._felt_by(index)
+                if touch is not None:
+                    break
+                rested_s = force = 0.0  # it rests too lightly
+        self.taps += 1
+        while (left := start[3] - self._goal[3]) > 1e-4:  # and out again
+            rate = min(manner.moving, 10.0 * left)
+            yield from self._follow((-side * rate * u, -side * rate * v, 0.0, rate, 0.0, 0.0), LETTING_GO_N)
+        self._goal = start
+        return touch
+
+    def _by_link(self, index: int, speed: float) -> Six:
+        """Return rates of the coordinates at which one link alone turns its finger towards the other [m/s].
+
+        The link is soft across itself, the carriages are not: a finger that they push on drags the object aside.
+        """
+        th, length = self.now.joints[3 * index + 2], (self.hand.link1_m, self.hand.link2_m)[index]
+        _, _, psi, d, _, _ = self._goal
+        inwards = psi if index == 0 else psi + math.pi
+        turn = math.copysign(speed / length, math.sin(inwards - th))
+        w = (-turn * length * math.sin(th), turn * length * math.cos(th))
+        u, v = math.cos(psi), math.sin(psi)
+        sign = 2.0 * index - 1.0
+        opening, round_ = sign * (w[0] * u + w[1] * v), sign * (w[1] * u - w[0] * v) / d
+        own = round_ - turn
+        return 0.5 * w[0], 0.5 * w[1], round_, opening, round_ if index else own, own if index else round_
+
+    def _yield(self) -> None:
+        """Want the hand where it is: what an object holds back is not pushed ever harder."""
+        self._goal = list(self.hand.forward(self.now.joints))
+
+    def _felt_by(self, index: int) -> Generator[Setpoint, Reading, Touch | None]:
+        """Average frames of one finger; return the place and the normal, None where most frames lack them."""
+        points: list[tuple[float, float]] = []
+        normals: list[float] = []
+        length = (self.hand.link1_m, self.hand.link2_m)[index]
+        for _ in range(_FRAMES * self.manner.frames):
+            self._yield()
+            yield from self._follow((0.0,) * 6, 0.0)
+            finger = self.now.fingers[index]
+            if not finger.touched or not math.isfinite(finger.phi):
+                continue
+            x, y, th = self.now.joints[3 * index : 3 * index + 3]
+            normal = th + finger.phi
+            points.append((
+                x + length * math.cos(th) + FINGER_M * math.cos(normal),
+                y + length * math.sin(th) + FINGER_M * math.sin(normal),
+            ))  # fmt: skip
+            normals.append(normal)
+        count = len(normals)
+        if count < self.manner.frames // 2:
+            return None
+        normal = normals[0] + sum(math.remainder(one - normals[0], math.tau) for one in normals) / count
+        place = sum(x for x, _ in points) / count, sum(y for _, y in points) / count
+        return Touch(place, normal + math.pi, math.inf, math.inf)
+
+
+_MIDDLE_RAD = math.radians(74.0)  # of an array
+FITS_RAD, _NEARLY_RAD = math.radians(0.5), math.radians(4.0)
+_NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
+_FRAMES = 2  # times those of a grasp, for lighter touches
+_CREEP = 0.3  # of the closing speed, once it has met it
+_FILTER_S, _RESTED_S, _BLIND_S = 0.03, 0.1, 0.1
+
+
+def _held_by(touches: Sequence[Touch]) -> tuple[float, tuple[float, float, float]]:
+    """Return the larger friction angle of a grasp on two touches [rad], and x, y, psi of the hand there."""
+    (ax, ay), (bx, by) = (
+        (one.point[0] + FINGER_M * math.cos(one.normal), one.point[1] + FINGER_M * math.sin(one.normal))
+        for one in touches
+    )
+    off = grasp_of((ax, ay), (bx, by), *(one.normal + math.pi for one in touches)).quality
+    return off, (0.5 * (ax + bx), 0.5 * (ay + by), math.atan2(by - ay, bx - ax))
