@@ -85,6 +85,10 @@ def slowed(tables: Mapping[str, Any], pace: float, folder: Path) -> Table:
         if device["driver"].startswith("sim-"):
             device.setdefault("process", PROCESS)
         _whole_paths(device, folder)
+    # The order sets the phases of ticks: the hand comes 0.38 of a period after the process of its fingers, not 0.62.
+    found["device"] = dict(
+        sorted(found.get("device", {}).items(), key=lambda item: item[1]["driver"].startswith("sim-"))
+    )
     return found
 
 

@@ -45,6 +45,11 @@ def test_what_is_written_is_what_was_made() -> None:
     assert tables["device"]["hand"]["pace"] == 0.25 and tables["device"]["left"]["world_age_max_s"] == 0.2
 
 
+def test_the_hand_ticks_sooner_after_its_fingers_than_the_next_process_would() -> None:
+    first, *others = slowed(_tables(), 0.25, ETC)["device"].items()
+    assert first[0] == "hand" and {device["process"] for _, device in others} == {"simulation"}
+
+
 def test_one_pace_goes_on_top_of_another() -> None:
     once, twice = slowed(_tables(), 0.125, ETC), slowed(slowed(_tables(), 0.5, ETC), 0.25, ETC)
     assert toml_text(once) == toml_text(twice)  # powers of two are exact
@@ -56,7 +61,7 @@ def test_in_slow_motion_axes_may_be_behind_and_be_pushed_as_far_as_ever(pace: fl
 
     def limits(pace: float) -> list[float]:
         found: list[float] = []
-        for table in (slowed(_tables(), pace, ETC) if pace < 1.0 else _tables())["device"].values():
+        for _, table in sorted((slowed(_tables(), pace, ETC) if pace < 1.0 else _tables())["device"].items()):
             for axis in table.get("axis", []):
                 told = {key: axis[key] for key in ("velocity_max", "following_error_max") if key in axis}
                 settings = AxisSettings(axis["name"], k=1.0, watch=Watch(**axis.get("watch", {})), **told)
