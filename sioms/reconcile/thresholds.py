@@ -91,7 +91,8 @@ STANDS = 0.5
 # --- when an effect counts
 
 GAIN = 0.05
-"""Least share of what remains that an effect must save on held-out blocks. Forty axes (0063)."""
+"""Least share of what remains that an effect must save on held-out blocks. Forty axes (0063). A law of any form in the
+place of a name: see 1043."""
 SURE = 2.0
 """Least number of standard errors of that saving. Forty axes (0063)."""
 PERIODIC_SURE = 3.0
