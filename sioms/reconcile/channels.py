@@ -18,6 +18,7 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.thresholds import COLOURED, DOUBTED, STEADY_ROWS, STRAYS
 
 LATTICE_SHARE = 0.998
 #: A scale or a drive effect must be this many standard errors away from nothing ...
@@ -41,12 +42,14 @@ class Finding:
     Attributes:
         values: parameters; errors: their standard errors.
         evidence: one sentence with figures.
+        doubted: what its law leaves is no noise: another law may do as well, or better.
     """
 
     effect: str
     values: Mapping[str, float]
     errors: Mapping[str, float]
     evidence: str
+    doubted: bool = False
 
 
 def with_resolution(model: AxisModel, session: Session) -> AxisModel:
@@ -166,15 +169,18 @@ def drive_output(force: Array, delay: float, lag: float, limit: float, dt: float
     return limited
 
 
-def drive(session: Session, model: AxisModel) -> list[Finding]:
+def drive(session: Session, model: AxisModel) -> tuple[list[Finding], str]:
     """Compare measured with commanded force: delay, lag, saturation, the fewest that explain it.
+
+    Returns:
+        What was found, and why nothing can be told of an axis with this drive; empty where that is not so.
 
     Raises:
         BadInputError: the measured force does not follow the commanded one, or later than is searched for.
     """
     records = [r for r in session.records if r.force_measured is not None]
     if not records:
-        return []
+        return [], ""
     dt = model.sample_time_s
     noise = _white(records)
     limit, at_limit = _plateau(records, noise)
@@ -194,6 +200,8 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
                     "while the command goes on",
                 )
             )
+        else:
+            limit = np.inf
     _check_follows(records, late, dt)
     if late.value > max(SIGNIFICANT * late.error, 1e-3 * dt) and late.left < (1.0 - DRIVE_GAIN) * late.none:
         other = "lag" if late.name == "delay" else "delay"
@@ -206,7 +214,38 @@ def drive(session: Session, model: AxisModel) -> list[Finding]:
                 f"{other} {np.sqrt(late.other / n):.3g}, with neither {np.sqrt(late.none / n):.3g} {model.force_unit}",
             )
         )
-    return found
+    times = {late.name: late.value} if found and found[-1].effect == late.name else {}
+    return _judged(records, found, _left(records, times.get("delay", 0.0), times.get("lag", 0.0), limit, dt), dt)
+
+
+def _judged(records: list[Record], found: list[Finding], left: list[Array], dt: float) -> tuple[list[Finding], str]:
+    """Doubt what was found where what it leaves goes on from row to row, as no noise does; see ``drive``."""
+    rows, squares = sum(map(len, left)), max(sum(float(e @ e) for e in left), 1e-300)
+    steps = sum(float(np.sum(np.diff(e) ** 2)) for e in left) / squares  # 2 of white noise, by 2 over the root of rows
+    if steps > 2.0 - max(STEADY_ROWS, COLOURED / np.sqrt(rows)):
+        return found, ""
+    odd = squares * (1.0 - 0.5 * steps)
+    whole = sum(float(np.sum(r.force_measured[UNSETTLED:] ** 2)) for r in records if r.force_measured is not None)
+    share = np.sqrt(odd / max(whole, 1e-300))
+    strays = ""
+    if share > STRAYS:
+        strays = (
+            f"the drive does not follow its command by a delay, a lag and a limit alone: {100 * share:.0f} % of the "
+            "measured force is something else (a supply that gives less at speed, a limit of its rate of change?); "
+            "describe force_measured as force to see the mechanics by what the drive did"
+        )
+    doubted = odd > DOUBTED * sum(float(e @ e) for e in _left(records, 0.0, 0.0, np.inf, dt))
+    return [replace(f, doubted=doubted) for f in found], strays
+
+
+def _left(records: list[Record], delay: float, lag: float, limit: float, dt: float) -> list[Array]:
+    """Return what a drive leaves of each measured force."""
+    return [
+        ((r.force if r.force_measured is None else r.force_measured) - drive_output(r.force, delay, lag, limit, dt))[
+            UNSETTLED:
+        ]
+        for r in records
+    ]
 
 
 def _check_follows(records: list[Record], late: _Late, dt: float) -> None:
@@ -222,7 +261,7 @@ def _check_follows(records: list[Record], late: _Late, dt: float) -> None:
         raise BadInputError(
             f"compare force_measured with force: with the best delay, lag and limit {share:.0f} % of its "
             "variance does not follow the commanded force; needs the drive's measured force of the same samples, or no "
-            "such column"
+            "such column, or, where the supply limits the drive, the measured force described as force"
         )
     if late.value > 0.98 * LATEST * dt and late.left < (1.0 - DRIVE_GAIN) * late.none:
         raise BadInputError(
@@ -249,12 +288,7 @@ def _latest(records: list[Record], limit: float, dt: float) -> _Late:
     """Fit a delay, and a lag, of a drive with a limit; return what leaves less."""
 
     def off(delay: float, lag: float) -> Array:
-        parts = [
-            (r.force_measured if r.force_measured is not None else r.force)
-            - drive_output(r.force, max(delay, 0.0), max(lag, 0.0), limit, dt)
-            for r in records
-        ]
-        return np.concatenate([e[UNSETTLED:] for e in parts])
+        return np.concatenate(_left(records, max(delay, 0.0), max(lag, 0.0), limit, dt))
 
     def misfit(delay: float, lag: float) -> float:
         e = off(delay, lag)

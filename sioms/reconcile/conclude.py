@@ -62,6 +62,9 @@ HELD = (
     "delay and lag are counted from a force that is held from row to row of the log; of a loop much faster than the "
     "log they are up to {:.2g} ms longer (loop_time_s in columns.toml would tell)"
 )
+#: What another drive is called among the alternatives, and what is said of it.
+OTHER_LAW = "another_law_of_the_drive"
+OF_DRIVE = "{} leaves what is no noise between measured and commanded force: another law of the drive may be meant"
 #: Steps of the last fit.
 LAST = 12
 #: The effect that another sample time looks like.
@@ -119,11 +122,14 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     beyond = ratio > (LARGE if named or terms else LOUD)
     if runs_away(found.fit.model):
         judged = replace(judged, refusals=(*judged.refusals, _of_inertia(nominal, found.fit.model)))
+    if ready.strays:
+        judged = replace(judged, refusals=(*judged.refusals, ready.strays))
     missing = bool(terms) or bool(leaning) or disturbance or beyond or odd or bool(judged.refusals)
     # what makes the force is a part of the model, too: with none of its mechanics missing it is not right
     missing = missing or (not named and foreign(searched(ready.problem.session), nominal))
     blindly = ready.blind and any(e.name == PAYLOAD for e in named)
-    said = outcome(bool(named), missing, bool(open_rivals) or blindly)
+    drives = [f.effect for f in ready.findings if f.doubted]
+    said = outcome(bool(named), missing, bool(open_rivals) or blindly or bool(drives))
     gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)
     notes = [*ready.notes, *judged.notes, *judged.refusals]
     notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
@@ -146,6 +152,9 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     terms = [e for e in terms if e.name not in {c.name for c in tried}]
     found_here = [e for e in named if e.name not in {c.name for c in tried}]
     others_said = _alternatives(fit.model, found_here, open_rivals, blindly) if said is Outcome.AMBIGUOUS else ()
+    if drives and said is Outcome.AMBIGUOUS:
+        others_said = (*others_said, tuple(OTHER_LAW if e.name in drives else e.name for e in found_here))
+        notes.append(OF_DRIVE.format(" and ".join(e.title for e in found_here if e.name in drives)))
     if blindly:
         found_here = [_rated(e, nominal, fit.model) for e in found_here]
     open_now = open_rivals if said is Outcome.AMBIGUOUS else []

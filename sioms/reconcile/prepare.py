@@ -74,6 +74,7 @@ class Prepared:
         timed: forces that keep their own time, by now among the known ones of the problems' records.
         apart: the final statement is made on whole records of their own.
         blind: nothing in the records tells their sample time.
+        strays: why nothing can be told of an axis with this drive; empty: it can.
     """
 
     nominal: AxisModel
@@ -88,6 +89,7 @@ class Prepared:
     timed: tuple[Timed, ...] = ()
     apart: bool = False
     blind: bool = False
+    strays: str = ""
 
     def beside(self, force: Timed) -> Prepared:
         """Take a force in time for known; records of their own have had none of it."""
@@ -187,7 +189,7 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
     coarse = lattice(seen, nominal)
     scale = index_scale(seen, nominal)
     findings += [f for f in (coarse, scale) if f is not None]
-    driven = drive(seen, nominal)
+    driven, strays = drive(seen, nominal)
     findings += driven
     for f in findings:
         model = model.with_effect(f.effect, dict(f.values))
@@ -237,6 +239,7 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
         tuple(notes),
         points=points,
         apart=bool(session.final),
+        strays=strays,
     )
 
 

@@ -66,6 +66,9 @@ NAMELESS = (
     "knocks",
     "stop",
     "detent",
+    "supply_limit",
+    "slew",
+    "interpolation",
 )
 #: Effects that are hidden from a solver who must do without them: unmet, and like nothing else in the library.
 UNMET = (
@@ -138,6 +141,10 @@ def _sound(axis: Axis) -> bool:
         return False
     if "saturation" in axis.named:
         share = float(np.mean(force[:4] > axis.named["saturation"]["limit"]))
+        if not SATURATED[0] < share < SATURATED[1]:
+            return False
+    if "supply_limit" in axis.nameless:
+        share = float(np.mean(force[:4] > 0.8 * axis.nameless["supply_limit"]["F0"]))
         if not SATURATED[0] < share < SATURATED[1]:
             return False
     if "thermal_gain" in axis.named and not WARM[0] < axis.named["thermal_gain"]["loss"] * world.heat < WARM[1]:
@@ -396,5 +403,12 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
             return {"k": f / reach * u(0.6, 1.5), "x0": reach * u(0.1, 0.3)}
         case "detent":
             return {"amp": f * u(0.1, 0.2), "x0": reach * u(-0.2, 0.2), "width": reach * u(0.06, 0.12)}
+        case "supply_limit":
+            return {"F0": f * u(0.3, 0.6), "v0": v * u(1.0, 1.6)}
+        case "slew":
+            return {"rate": f / (lost * u(8.0, 30.0))}
+        case "interpolation":
+            n = float(rng.integers(32, 129))
+            return {"amp": max(x / n * u(0.01, 0.04), 3.0 * q), "n": n, "phase": phase}
         case _:
             raise ValueError(f"draw effect {name}: unknown; known are {', '.join((*NAMED, *NAMELESS))}")

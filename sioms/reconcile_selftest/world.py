@@ -133,6 +133,12 @@ class Plant(NamedTuple):
     detent_amp: float = 0.0
     detent_x0: float = 0.0
     detent_width: float = 1.0
+    supply_limit_F0: float = np.inf
+    supply_limit_v0: float = 1.0
+    slew_rate: float = np.inf
+    interpolation_amp: float = 0.0
+    interpolation_n: float = 0.0
+    interpolation_phase: float = 0.0
     knocks_height: float = 0.0
     knocks_count: float = 0.0
 
@@ -263,9 +269,10 @@ def _march(
     s0 = held / (p.lugre_xs if p.lugre_Fs > 0.0 else p.presliding_xs)
     s1 = 0.1 * np.sqrt(s0 * motor)
     x = v = xl = vl = z = bristle = hyst = lagged = 0.0
-    e_old = u_old = y_old = y_older = speed = 0.0
+    e_old = u_old = y_old = y_older = speed = slewed = 0.0
     for i in range(len(command)):
         seen = p.encoder_scale_gain * x + p.eccentricity_amp * np.sin(turn * x + p.eccentricity_phase)
+        seen += p.interpolation_amp * np.sin(p.interpolation_n * turn * x + p.interpolation_phase)
         counts[i] = int(np.floor((seen + jitter[i]) / quantum + 0.5) * np.round(p.encoder_quantisation_factor))
         y = counts[i] * p.resolution
         if i == 0:
@@ -282,9 +289,13 @@ def _march(
         before, passed, mean = np.floor(x / p.pitch), False, 0.0
         for s in range(sub):
             goal = _held(queue, late + i + s / sub - p.delay_delay / p.sample_s, 1.0 / sub)
+            slewed += min(max(goal - slewed, -p.slew_rate * h), p.slew_rate * h)
+            goal = slewed
             drive = lagged + 0.5 * follow * (goal - lagged) if p.lag_tau > 0.0 else goal
             lagged += follow * (goal - lagged)
             drive = min(max(drive, -p.saturation_limit), p.saturation_limit)
+            most, least = 1.0 - v / p.supply_limit_v0, 1.0 + v / p.supply_limit_v0
+            drive = min(max(drive, -p.supply_limit_F0 * max(least, 0.0)), p.supply_limit_F0 * max(most, 0.0))
             mean += drive
             if p.thermal_gain_loss > 0.0:
                 heat += h / p.thermal_gain_tau * ((drive / p.rated) ** 2 - heat)

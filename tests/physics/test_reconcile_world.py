@@ -3,12 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from sioms.reconcile.command.selftest import record
+from sioms.reconcile.axis import analyse
+from sioms.reconcile.command.selftest import record, write_public
+from sioms.reconcile.conclude import OTHER_LAW
 from sioms.reconcile.effects import library
+from sioms.reconcile.files.axis import read_data, read_model
+from sioms.reconcile.prepare import Options
+from sioms.reconcile.verdict import Outcome
 from sioms.reconcile_selftest.axis import Axis, Servo
 from sioms.reconcile_selftest.draw import NAMED, SATURATED, draw_axis
 from sioms.reconcile_selftest.score import PRIMARY
@@ -91,6 +97,44 @@ def test_the_current_lags_by_its_time_constant() -> None:
     assert np.interp(1.0 - np.exp(-1.0), seen.force_measured[20:40] / seen.force[40], np.arange(20)) + 0.5 == (
         pytest.approx(5.0, rel=0.02)
     )
+
+
+def hides(**nameless: dict[str, float]) -> Recording:
+    command = 0.03 * np.sign(np.sin(2.0 * np.pi * np.arange(3000) / 1000.0))
+    return World(replace(BARE, nameless=nameless)).record(command, noise=0.0)
+
+
+def test_a_drive_of_a_limited_rate_changes_by_no_more_and_gets_there() -> None:
+    seen = hides(slew={"rate": 2000.0})
+    steps = np.abs(np.diff(seen.force_measured))
+    assert np.max(steps) == pytest.approx(2.0, rel=1e-6)
+    assert np.max(np.abs(seen.force)) > 40.0 and np.mean(steps > 1.999) > 0.02
+
+
+def test_a_weak_supply_gives_nothing_at_its_speed_and_all_at_rest() -> None:
+    seen = hides(supply_limit={"F0": 15.0, "v0": 0.2})
+    speed = np.gradient(seen.counts * 1e-9, 1e-3)
+    along = seen.force_measured * np.sign(speed) > 0.0
+    assert np.max(np.abs(seen.force_measured[along])) == pytest.approx(15.0, rel=0.02)
+    assert np.all(np.abs(seen.force_measured)[along] <= 15.0 * (1.0 - np.abs(speed[along]) / 0.2) + 0.3)
+
+
+def test_an_encoder_errs_within_its_signal_period_and_nowhere_else() -> None:
+    size, n = 2e-6, 50.0
+    plain, wrong = hides(), hides(interpolation={"amp": size, "n": n, "phase": 0.0})
+    off = (wrong.counts - plain.counts) * 1e-9
+    early = slice(0, 30)  # before the controller has acted on it
+    place = plain.counts[early] * 1e-9
+    np.testing.assert_allclose(off[early], size * np.sin(2.0 * np.pi * n * place / 0.01), atol=0.1 * size)
+
+
+def test_a_limited_rate_of_change_is_named_no_lag(tmp_path: Path) -> None:
+    axis = draw_axis("slewing", "unknown", np.random.default_rng([88002, 3]), "slew")
+    assert axis.current
+    write_public(axis, record(axis), tmp_path / "axis")
+    model = read_model(tmp_path / "axis" / "nominal.toml")
+    verdict = analyse(read_data(tmp_path / "axis", model), model, Options(pictures=False))
+    assert verdict.outcome is Outcome.AMBIGUOUS and (OTHER_LAW,) in verdict.alternatives
 
 
 def test_an_eccentric_encoder_is_right_at_every_mark() -> None:

@@ -96,13 +96,13 @@ def test_index_marks_give_the_scale(gain: float) -> None:
     [("delay", "delay", 2.7e-3, 2e-5), ("lag", "tau", 3e-3, 1e-4), ("saturation", "limit", 0.35, 2e-3)],
 )
 def test_the_drive_is_judged_by_its_current(effect: str, symbol: str, value: float, within: float) -> None:
-    found = drive(session(AXIS.with_effect(effect, {symbol: value}), 2.0 * COMMAND), AXIS)
-    assert [f.effect for f in found] == [effect]
+    found, strays = drive(session(AXIS.with_effect(effect, {symbol: value}), 2.0 * COMMAND), AXIS)
+    assert [f.effect for f in found] == [effect] and not found[0].doubted and not strays
     assert found[0].values[symbol] == pytest.approx(value, abs=within)
 
 
 def test_a_good_drive_shows_nothing() -> None:
-    assert drive(session(), AXIS) == []
+    assert drive(session(), AXIS) == ([], "")
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -112,6 +112,34 @@ def test_a_measured_force_that_does_not_follow_the_command_is_refused_not_named(
     place, force, measured = rng.standard_normal((3, 2000))
     with pytest.raises(BadInputError, match=r"variance does not follow the commanded force; needs"):
         drive(Session((Record("noise", place, force, place, measured),)), AXIS)
+
+
+def slewed(force: np.ndarray, most: float) -> np.ndarray:
+    """Follow a command by no more than so much a row."""
+    out = np.zeros_like(force)
+    for i in range(1, len(force)):
+        out[i] = out[i - 1] + np.clip(force[i - 1] - out[i - 1], -most, most)
+    return out
+
+
+@pytest.mark.parametrize(("most", "is_little"), [(0.03, False), (0.08, True)])
+def test_a_drive_of_a_limited_rate_of_change_is_no_sure_lag(most: float, is_little: bool) -> None:
+    rng = np.random.default_rng(7)
+    force = 0.4 * np.sign(np.sin(2.0 * np.pi * 1.5 * T[:2000])) + 0.1 * np.sin(2.0 * np.pi * 0.4 * T[:2000])
+    measured = slewed(force, most) + 2e-3 * rng.standard_normal(2000)
+    place = 1e-3 * np.arange(2000)
+    found, strays = drive(Session((Record("steps", place, force, place, measured),)), AXIS)
+    assert [f.effect for f in found] in (["lag"], ["delay"]) and found[0].doubted
+    assert (strays == "") is is_little
+
+
+def test_a_supply_that_gives_less_at_speed_is_no_limit_of_the_drive() -> None:
+    rng = np.random.default_rng(8)
+    force, speed = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]), 0.3 * np.sin(2.0 * np.pi * 1.5 * T[:2000] - 0.6)
+    measured = np.clip(force, -0.4 * (1.0 + speed), 0.4 * (1.0 - speed)) + 2e-3 * rng.standard_normal(2000)
+    place = 1e-3 * np.arange(2000)
+    found, strays = drive(Session((Record("supply", place, force, place, measured),)), AXIS)
+    assert all(f.doubted for f in found) and "describe force_measured as force" in strays
 
 
 def test_a_drive_later_than_is_searched_is_refused_not_named_by_the_bound() -> None:
@@ -130,8 +158,8 @@ def test_a_slow_drive_of_a_restless_command_is_not_limited_and_known_as_well_as_
         force = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]) + 0.2 * rng.standard_normal(2000)
         measured = drive_output(force, 0.0, lag_s, np.inf, 1e-3) + 2e-3 * rng.standard_normal(2000)
         place = 1e-3 * np.arange(2000)
-        (found,) = drive(Session((Record("restless", place, force, place, measured),)), AXIS)
-        assert found.effect == "lag"
+        (found,), strays = drive(Session((Record("restless", place, force, place, measured),)), AXIS)
+        assert found.effect == "lag" and not found.doubted and not strays
         z.append((found.values["tau"] - lag_s) / found.errors["tau"])
     assert 0.5 < np.sqrt(np.mean(np.square(z))) < 1.6
 
