@@ -33,6 +33,8 @@ from .handles import Handle, Waits
 from .outputs import WHOLE, Outputs, safe_of
 from .pages import Pages
 
+SHOWN_NS = 1_000_000
+"""A stop by an alarm is shown within so long, by the tick that follows it [ns]."""
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
 
@@ -110,6 +112,8 @@ class Stops:
         self.resets, self.asked, self.faults = PartTimes(), PartTimes(), PartTimes()
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._faulty: set[tuple[int, int]] = set()
+        self._unshown: list[tuple[AnyBlock, list[tuple[int, int]]]] = []
+        """What alarms have stopped since the last publication: for who resets it, that counts from when it is shown."""
         self._unsafe: dict[int, tuple[int, int]] = {}
         """Blocks with safe values that could not be set: when that was logged, and failures since."""
         self._device, self._blocks = device, blocks
@@ -243,7 +247,13 @@ class Stops:
         return [part for c in channels for part in parts_of(int(c), bit, block.spec.channels[c].width)]
 
     def note_faults(self) -> None:
-        """Note that axes have come into fault, and tell the daemon, before anybody can see it; cheap where none has."""
+        """Note that axes have come into fault, and tell the daemon, before anybody can see it; and what alarms have
+        stopped. Cheap where there is none.
+        """
+        if self._unshown:
+            unshown, self._unshown = self._unshown, []
+            for block, parts in unshown:
+                self.asked.note(id(block), parts, time.monotonic_ns())
         for block in self._axes:
             fresh = block.bank.take_faults()
             if not fresh:
@@ -571,8 +581,9 @@ class Stops:
             self.stop_node(each, channels, bit, source)
             spec = each.spec
             parts = self._parts(each, channels, bit)
+            self._unshown.append((each, parts))
             self._log("warning", f"emergency stop of {name} by {source}")
-            at_ns = time.monotonic_ns()
+            at_ns = time.monotonic_ns() + SHOWN_NS  # the daemon takes it for now, if it hears of it before
             self._note(
                 node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid(), at_ns=at_ns)
             )

@@ -16,7 +16,7 @@ from own_writes_rig import CLOCK, SENT, Client, World, own_time
 from sioms.drivers.sim.axes import SimAxes
 from sioms.drivers.sim.io import SimIo
 from sioms.protocol.driver_verbs import DriverVerb
-from sioms.protocol.flags import ControlMode, NodeClass, Request
+from sioms.protocol.flags import ControlMode, NodeClass, Reaction, Request
 from sioms.protocol.messages import MalformedMessage
 from sioms.protocol.records import AXIS_WRITE, WRITE, WRITE_STRUCT
 from sioms.protocol.stopjournal import StopJournal, node_entry, parts_of, replay
@@ -165,6 +165,20 @@ def test_a_refusal_tells_of_a_fault_as_a_reading_does(axes: World) -> None:
     assert owner.served() == [errno.EIO]
     owner.reset()
     assert owner.served()[1:] == [None] and not _in_fault(axes)
+
+
+def test_a_stop_by_an_alarm_that_nobody_can_have_seen_is_younger_than_any_reset(axes: World) -> None:
+    owner = Sender(axes, axes.open(0, [0], exclusive=True))
+    block: Any = axes.runtime.blocks[0]
+    rule: Any = SimpleNamespace(node="mod0.x", stops=[0], bit=-1)
+    axes.runtime.stops.stop_by_alarm(Reaction.STOP_NODE, block, rule, "too far")
+    owner.reset()  # it has been stopped, but no reading shows that
+    assert owner.served() == [errno.EAGAIN] and block.bank.is_stopped(0)
+    axes.runtime.stops.stop_by_alarm(Reaction.STOP_NODE, block, rule, "too far")
+    CLOCK.now_ns += LATER_NS
+    axes.runtime.publish(block, CLOCK())
+    owner.reset()
+    assert owner.served()[1:] == [None] and not block.bank.is_stopped(0)
 
 
 def test_a_reset_by_the_daemon_that_was_sent_before_a_fault_leaves_it(axes: World, tmp_path: Any) -> None:
