@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.hand.contacts import FINGER_M
-from sioms.hand.shape import Parallel, Shape, Touch
+from sioms.hand.shape import Parallel, Shape, Touch, clipped
 
 Array = NDArray[np.float64]
 
@@ -74,7 +74,8 @@ def sides_through(touches: Sequence[Touch]) -> Sides:
     for number, group in enumerate(groups):
         at, angle = _line(inner, normals, group)
         lines.append((group, angle))
-        corners, owners = _cut(corners, owners, number, at, angle)
+        side = Touch((float(at[0]), float(at[1])), angle, math.inf, math.inf)
+        corners, owners = clipped(corners, owners, number, side)
     named, angles = [], []
     for i, owner in enumerate(owners):
         along = corners[(i + 1) % len(corners)] - corners[i]
@@ -122,26 +123,6 @@ def _line(points: Array, normals: Array, group: Sequence[int]) -> tuple[Array, f
     first = normals[group[0]]
     angle = first + float(np.mean([math.remainder(normals[i] - first, math.tau) for i in group]))
     return points[list(group)].mean(axis=0), angle
-
-
-def _cut(
-    corners: list[Array], owners: list[int], number: int, at: Array, angle: float
-) -> tuple[list[Array], list[int]]:
-    """Cut off what lies beyond a side."""
-    n = np.array([math.cos(angle), math.sin(angle)])
-    over = [float(n @ (corner - at)) for corner in corners]
-    kept: list[Array] = []
-    of: list[int] = []
-    for i, corner in enumerate(corners):
-        j = (i + 1) % len(corners)
-        if over[i] <= 0.0:
-            kept.append(corner)
-            of.append(owners[i])
-        if (over[i] <= 0.0) != (over[j] <= 0.0):
-            share = over[i] / (over[i] - over[j])
-            kept.append(corner + share * (corners[j] - corner))
-            of.append(number if over[i] <= 0.0 else owners[i])
-    return kept, of
 
 
 def met(corners: Array, radius_m: float, origin: Array, angle: float) -> float | None:

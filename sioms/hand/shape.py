@@ -350,7 +350,7 @@ def across_sides(touches: Sequence[Touch], direction: float) -> list[Parallel]:
     corners = [middle + reach * np.array(at) for at in ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))]
     owners = [-1, -1, -1, -1]
     for number, side in enumerate(sides):
-        corners, owners = _clipped(corners, owners, number, side)
+        corners, owners = clipped(corners, owners, number, side)
     found = []
     for i, owner in enumerate(owners):
         if owner < 0:
@@ -377,7 +377,7 @@ def _inset(side: Touch, by_m: float) -> Touch:
     return replace(side, point=(x - by_m * math.cos(side.normal), y - by_m * math.sin(side.normal)))
 
 
-def _clipped(corners: list[Array], owners: list[int], number: int, side: Touch) -> tuple[list[Array], list[int]]:
+def clipped(corners: list[Array], owners: list[int], number: int, side: Touch) -> tuple[list[Array], list[int]]:
     """Cut off what lies beyond a side."""
     n = np.array([math.cos(side.normal), math.sin(side.normal)])
     over = [float(n @ (corner - np.array(side.point))) for corner in corners]
