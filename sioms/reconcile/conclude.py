@@ -28,6 +28,7 @@ from sioms.reconcile.free import freely
 from sioms.reconcile.gaps import free_gaps, measure, rungs, session_states
 from sioms.reconcile.judge import Judgement, judge
 from sioms.reconcile.locate import Spectrum, locate, spectra
+from sioms.reconcile.locked import locked
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.plausible import leans
@@ -45,9 +46,11 @@ from sioms.reconcile.thresholds import (
     CHANCE,
     DWARFED,
     LARGE,
+    LOCKED,
     LOUD,
     MISSED,
     MOSTLY,
+    MOSTLY_LOCKED,
     PLACES_A_PERIOD,
     QUIET,
     REFUTED,
@@ -128,6 +131,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     # what makes the force is a part of the model, too: with none of its mechanics missing it is not right
     missing = missing or (not named and foreign(searched(ready.problem.session), nominal))
     blindly = ready.blind and any(e.name == PAYLOAD for e in named)
+    wave = locked(ready.problem, found.fit)
+    missing = missing or (wave is not None and wave.share > (MOSTLY_LOCKED if named else LOCKED))
     drives = [f.effect for f in ready.findings if f.doubted]
     said = outcome(bool(named), missing, bool(open_rivals) or blindly or bool(drives))
     gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)
@@ -135,6 +140,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     notes += [f"{e.title} leans on the end of what it can be: it stands for something else" for e in leaning]
     if ready.held and any(e.name in TIMES for e in named):
         notes.append(HELD.format(0.5e3 * fit.model.sample_time_s))
+    if wave is not None:
+        notes.append(wave.text)
     if disturbance:
         notes.append(_of_bursts(ready.problem, found.fit, burst))
     elif beyond:

@@ -80,6 +80,10 @@ and by the first over the root of the rows (four standard errors of white noise)
 the third share of what no law leaves, and of the mechanics nothing can be told above the last share of the force. Forty
 drawn axes: 1.92 to 2.02 where the law holds; 0.001 to 0.12 of a supply that gives less at speed, 0.03 to 1.86 of a
 limited rate of change (1006)."""
+LOCKED, MOSTLY_LOCKED = 0.02, 0.2
+"""Something is missing where this share of the residual is one wave locked to the place; beside what is named, where it
+is the second. Thirty-five drawn axes without one: 0.008 at most, of an encoder coarser than stated; 0.028 to 0.77 of an
+error within the signal period (1006)."""
 JITTERS, STAMPED = 0.02, 0.7
 """Rows come at no fixed rate where their steps vary by the first share, and were read at their stamps where the
 position is rougher by the second on an even grid. Chosen: stamps that are late notes of even samples make it rougher at

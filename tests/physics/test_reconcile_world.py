@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.axis import analyse
+from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.command.selftest import record, write_public
 from sioms.reconcile.conclude import OTHER_LAW
 from sioms.reconcile.effects import library
@@ -128,12 +129,25 @@ def test_an_encoder_errs_within_its_signal_period_and_nowhere_else() -> None:
     np.testing.assert_allclose(off[early], size * np.sin(2.0 * np.pi * n * place / 0.01), atol=0.1 * size)
 
 
+def verdict_on(axis: Axis, folder: Path) -> AxisVerdict:
+    write_public(axis, record(axis), folder / "axis")
+    model = read_model(folder / "axis" / "nominal.toml")
+    return analyse(read_data(folder / "axis", model), model, Options(pictures=False))
+
+
+def test_an_encoder_that_errs_within_its_signal_period_is_not_nothing(tmp_path: Path) -> None:
+    """Its waves had passed for noise of the sensor."""
+    axis = draw_axis("waves", "unknown", np.random.default_rng([88002, 0]), "interpolation")
+    order = round(axis.nameless["interpolation"]["n"])
+    verdict = verdict_on(axis, tmp_path)
+    assert verdict.outcome is Outcome.UNEXPLAINED and not verdict.effects
+    assert any(f"comes {order} times in a pitch" in note for note in verdict.notes)
+
+
 def test_a_limited_rate_of_change_is_named_no_lag(tmp_path: Path) -> None:
     axis = draw_axis("slewing", "unknown", np.random.default_rng([88002, 3]), "slew")
     assert axis.current
-    write_public(axis, record(axis), tmp_path / "axis")
-    model = read_model(tmp_path / "axis" / "nominal.toml")
-    verdict = analyse(read_data(tmp_path / "axis", model), model, Options(pictures=False))
+    verdict = verdict_on(axis, tmp_path)
     assert verdict.outcome is Outcome.AMBIGUOUS and (OTHER_LAW,) in verdict.alternatives
 
 
