@@ -36,7 +36,7 @@ class Control:
         self._sock = socket.socket(fileno=fd)
         self._sock.setblocking(False)
         self._kept: deque[Received] = deque()
-        self._unsent: deque[bytes] = deque()
+        self._unsent: deque[tuple[bytes, list[int]]] = deque()
         self._room = room
 
     def fileno(self) -> int:
@@ -57,33 +57,44 @@ class Control:
         is_kept = len(self._unsent) < (MOST_UNSENT >> 4 if isinstance(message, driver_verbs.LogLine) else MOST_UNSENT)
         if self._unsent:
             if is_kept:
-                self._unsent.append(message.packed())
+                self._unsent.append((message.packed(), []))
             return
         try:
             self._sock.send(message.packed())
         except BlockingIOError:
-            self._unsent.append(message.packed())
+            self._unsent.append((message.packed(), []))
             self._room(True)
         except OSError:
             return  # a daemon that is gone is noticed by its end of file, a hung one by its lease
+
+    @property
+    def waits_for_room(self) -> bool:
+        """Whether there is something to send for which there was no room."""
+        return bool(self._unsent)
 
     def send_rest(self) -> None:
         """Send what there was no room for."""
         if not self._unsent:
             return
-        try:
-            while self._unsent:
-                self._sock.send(self._unsent[0])
-                self._unsent.popleft()
-        except BlockingIOError:
-            return
-        except OSError:
-            self._unsent.clear()
+        while self._unsent:
+            packet, fds = self._unsent[0]
+            try:
+                socket.send_fds(self._sock, [packet], fds) if fds else self._sock.send(packet)
+            except BlockingIOError:
+                return
+            except OSError:
+                pass  # as above
+            self._unsent.popleft()
+            for fd in fds:
+                os.close(fd)
         self._room(False)
 
     def tell_ready(self, pages: Sequence[int]) -> None:
-        """Tell the daemon that publishing has begun, with the descriptors of the pages."""
-        socket.send_fds(self._sock, [driver_verbs.Ready(len(pages)).packed()], pages)
+        """Tell the daemon that publishing has begun, with the descriptors of the pages; after what was told before."""
+        self._unsent.append((driver_verbs.Ready(len(pages)).packed(), [os.dup(fd) for fd in pages]))
+        self.send_rest()
+        if self._unsent:
+            self._room(True)
 
     def orders(self) -> Iterator[Order]:
         """Give the orders that have come; what lies before and between them is kept for ``take``.
@@ -111,9 +122,9 @@ class Control:
         return self._kept.popleft() if self._kept else self._receive()
 
     def close(self) -> None:
-        """Close the socket, and the descriptors of what has not been taken."""
+        """Close the socket, and the descriptors of what has not been taken or sent."""
         self._sock.close()
-        for _, fds in self._kept:
+        for _, fds in (*self._kept, *self._unsent):
             for fd in fds:
                 os.close(fd)
 

@@ -256,6 +256,7 @@ class Runtime:
     def start(self) -> None:
         """Be stopped as the process before this one was, tick for the first time, and tell the daemon."""
         self.watch(self._control.fileno(), self._control_readable)
+        self._watch_room(self._control.waits_for_room)  # a driver may have told much while it was opened
         self.watch(self._timer.fd, self._on_timer)
         self.watch(self._line_timer.fd, self._on_line_timer)
         self.watch(self.clients.timestamps.fd, self.clients.timestamps.look_at_clock)

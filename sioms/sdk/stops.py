@@ -34,7 +34,7 @@ from .outputs import WHOLE, Outputs, safe_of
 from .pages import Pages
 
 SHOWN_NS = 1_000_000
-"""A stop by an alarm is shown within so long, by the tick that follows it [ns]."""
+"""A stop by an alarm is shown within so long, by a tick that follows it or by the list of what is stopped [ns]."""
 TOLD_NS = 10_000_000_000
 """How often it is logged that safe outputs could not be set."""
 
@@ -112,8 +112,9 @@ class Stops:
         self.resets, self.asked, self.faults = PartTimes(), PartTimes(), PartTimes()
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._faulty: set[tuple[int, int]] = set()
-        self._unshown: list[tuple[AnyBlock, list[tuple[int, int]]]] = []
-        """What alarms have stopped since the last publication: for who resets it, that counts from when it is shown."""
+        self._unshown: list[tuple[AnyBlock, list[tuple[int, int]], int]] = []
+        """What alarms have stopped since the last publication: for who resets it, that counts from when it is shown, or
+        from when the daemon has been told that it is [ns, CLOCK_MONOTONIC]."""
         self._unsafe: dict[int, tuple[int, int]] = {}
         """Blocks with safe values that could not be set: when that was logged, and failures since."""
         self._device, self._blocks = device, blocks
@@ -252,8 +253,8 @@ class Stops:
         """
         if self._unshown:
             unshown, self._unshown = self._unshown, []
-            for block, parts in unshown:
-                self.asked.note(id(block), parts, time.monotonic_ns())
+            for block, parts, at_ns in unshown:
+                self.asked.note(id(block), parts, min(at_ns, time.monotonic_ns()))
         for block in self._axes:
             fresh = block.bank.take_faults()
             if not fresh:
@@ -581,9 +582,9 @@ class Stops:
             self.stop_node(each, channels, bit, source)
             spec = each.spec
             parts = self._parts(each, channels, bit)
-            self._unshown.append((each, parts))
-            self._log("warning", f"emergency stop of {name} by {source}")
             at_ns = time.monotonic_ns() + SHOWN_NS  # the daemon takes it for now, if it hears of it before
+            self._unshown.append((each, parts, at_ns))
+            self._log("warning", f"emergency stop of {name} by {source}")
             self._note(
                 node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid(), at_ns=at_ns)
             )

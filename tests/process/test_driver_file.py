@@ -154,3 +154,13 @@ def test_a_driver_that_raises_ends_alone_and_says_why(start_daemon: Callable[...
             node.set(1.0, 1.0)
             shows(node, 1.0, 1.0)
         assert daemon.device("heat")["pid"] == pid
+
+
+def test_what_a_driver_tells_while_it_is_made_waits_for_room_and_not_for_the_daemon_to_say_something() -> None:
+    """Whatever it told later waited behind that: faults, a lost link, its own stops."""
+    made = "        super().__init__(name, settings, kit)\n"
+    loud = "        for n in range(1000):\n            self.kit.log('info', f'line {n}')\n"
+    with daemons() as start:
+        rig = start(CONFIG.replace("3", "1000000"), files={"heater.py": DRIVER.replace(made, made + loud)})
+        with rig.cell("tester") as cell:
+            wait_for(lambda: cell.status()["devices"][1]["link"] == "link_lost", "link", 5.0)

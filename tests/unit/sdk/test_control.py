@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import socket
 
 import pytest
 
-from sioms.descriptors import is_readable
+from sioms.descriptors import is_readable, receive
 from sioms.protocol.driver_verbs import (
     FROM_DRIVER,
     HeldSilent,
@@ -15,6 +16,7 @@ from sioms.protocol.driver_verbs import (
     MarkerSignalled,
     NodeReset,
     NodeStop,
+    Ready,
     Shutdown,
 )
 from sioms.protocol.verbs import Message, take
@@ -75,4 +77,27 @@ def test_what_a_daemon_that_is_held_up_has_left_no_room_for_is_sent_later_in_its
     daemon.close()
     control.send_rest()
     assert not control._unsent and watched == [True, False, True, False]
+    control.close()
+
+
+def test_a_driver_that_has_much_to_tell_while_it_starts_is_ready_when_there_is_room() -> None:
+    """With no room in the socket the start ended with an error, or the pages came ahead of what was told before."""
+    daemon, driver = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    control = Control(driver.detach())
+    while not control.waits_for_room:
+        control.tell(LogLine("info", "looking for the drive"))
+    control.tell(HeldSilent("mod0", "mute"))
+    page = os.memfd_create("page")
+    control.tell_ready([page])
+    os.close(page)
+    heard: list[tuple[Message, int]] = []
+    while control.waits_for_room or is_readable(daemon):
+        packet, fds = receive(daemon, 1 << 16, 8)
+        heard.append((take(packet, FROM_DRIVER, state="starting")[1], len(fds)))
+        for fd in fds:
+            os.close(fd)
+        control.send_rest()
+    assert heard[-2:] == [(HeldSilent("mod0", "mute"), 0), (Ready(1), 1)]
+    control.tell_ready([])
+    daemon.close()
     control.close()

@@ -21,9 +21,10 @@ from sioms.protocol.messages import MalformedMessage
 from sioms.protocol.records import AXIS_WRITE, WRITE, WRITE_STRUCT
 from sioms.protocol.stopjournal import StopJournal, node_entry, parts_of, replay
 from sioms.protocol.verbs import Heard, Part, Passed, Write
+from sioms.sdk.stops import SHOWN_NS
 
 AXIS = {"velocity_max": 0.5, "acceleration_max": 5.0, "motor": {"mass": 1.0}, "force_max": 60.0}
-LATER_NS = 1_000_000
+LATER_NS = SHOWN_NS // 2
 
 
 def _world(driver: Any, table: dict[str, Any], device: Device | None = None) -> Iterator[World]:
@@ -179,6 +180,20 @@ def test_a_stop_by_an_alarm_that_nobody_can_have_seen_is_younger_than_any_reset(
     axes.runtime.publish(block, CLOCK())
     owner.reset()
     assert owner.served()[1:] == [None] and not block.bank.is_stopped(0)
+
+
+def test_a_stop_by_an_alarm_that_the_daemon_shows_is_reset_though_a_slow_device_shows_it_later(axes: World) -> None:
+    """The daemon had acknowledged it, and the driver did nothing: at 10 Hz a reading shows a stop 100 ms later."""
+    block: Any = axes.runtime.blocks[0]
+    rule: Any = SimpleNamespace(node="mod0.x", stops=[0], bit=-1)
+    axes.runtime.stops.stop_by_alarm(Reaction.STOP_NODE, block, rule, "too far")
+    CLOCK.now_ns += SHOWN_NS + 1
+    sent_ns = CLOCK()
+    CLOCK.now_ns += LATER_NS
+    axes.runtime.publish(block, CLOCK())
+    axes.order(DriverVerb.NODE_RESET, 0, [0], -1, "eva", axes.latch.resets, CLOCK(), sent_ns)
+    axes.runtime.heed()
+    assert not block.bank.is_stopped(0)
 
 
 def test_a_reset_by_the_daemon_that_was_sent_before_a_fault_leaves_it(axes: World, tmp_path: Any) -> None:
