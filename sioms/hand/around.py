@@ -13,7 +13,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,7 +74,9 @@ def sides_through(touches: Sequence[Touch]) -> Sides:
         at, angle = _line(inner, normals, group)
         lines.append((group, angle))
         side = Touch((float(at[0]), float(at[1])), angle, math.inf, math.inf)
-        corners, owners = clipped(corners, owners, number, side)
+        left = clipped(corners, owners, number, side)
+        if left[0]:  # else it contradicts the others: the object was moved, or is thinner than its corners are thought
+            corners, owners = left
     named, angles = [], []
     for i, owner in enumerate(owners):
         along = corners[(i + 1) % len(corners)] - corners[i]
@@ -195,8 +196,8 @@ class Around:
                     guess = met(corners, radius, origin, side)
                     off = math.pi if guess is None else abs(math.remainder(guess - touch.normal, math.tau))
                     self._wrong[i] = 0.8 * self._wrong[i] + min(off, _WRONG_RAD)
-        self._touches = [old for old in self._touches if not any(map(partial(_contradict, old), touches))]
-        self._touches += touches
+        for touch in touches:  # also of the first of them, if that has moved the object
+            self._touches = [old for old in self._touches if not _contradict(old, touch)] + [touch]
         self._tried.append((x, y, psi))
         self.smooth = self._wrong[1] < self._wrong[0]
 

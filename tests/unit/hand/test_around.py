@@ -74,3 +74,11 @@ def test_feeling_round_finds_a_parallel_grasp_of_what_two_touches_do_not_tell(fa
     found = [feel_round(draw(number, 42, [family]), 14) for number in range(12)]
     within = sum(eta <= 1.0 * DEG for eta, _ in found)
     assert within >= 11, [round(eta / DEG, 2) for eta, _ in found]
+
+
+@pytest.mark.parametrize("half_mm", [-10.0, 0.1, 0.6], ids=["moved by the first touch", "a foil", "a sheet"])
+def test_touches_that_leave_nothing_between_them_are_no_error(half_mm: float) -> None:
+    around = Around()
+    for x_mm in (-5.0, 0.0, 5.0):
+        around.add([touch(x_mm, half_mm, 90.0), touch(x_mm, -half_mm, -90.0)], 1e-3 * x_mm, 0.0, 0.5 * math.pi)
+        assert around.next(0.5 * math.pi) is None or around.size_m < 0.05
