@@ -219,14 +219,19 @@ def drive(session: Session, model: AxisModel) -> tuple[list[Finding], str]:
 
 
 def _judged(records: list[Record], found: list[Finding], left: list[Array], dt: float) -> tuple[list[Finding], str]:
-    """Doubt what was found where what it leaves goes on from row to row, as no noise does; see ``drive``."""
-    rows, squares = sum(map(len, left)), max(sum(float(e @ e) for e in left), 1e-300)
-    steps = sum(float(np.sum(np.diff(e) ** 2)) for e in left) / squares  # 2 of white noise, by 2 over the root of rows
-    if steps > 2.0 - max(STEADY_ROWS, COLOURED / np.sqrt(rows)):
+    """Doubt what was found where what it leaves goes on from row to row, as no noise does; see ``drive``.
+
+    Its zero is no law of the drive, and does not count. Its scale doubts a lag, which it looks like, and no more.
+    """
+    measured = np.concatenate([r.force_measured[UNSETTLED:] for r in records if r.force_measured is not None])
+    ends = np.cumsum([len(e) for e in left])[:-1]
+    whole = np.concatenate(left)
+    whole -= np.mean(whole)
+    odd = _steady(np.split(whole, ends))
+    if odd == 0.0:
         return found, ""
-    odd = squares * (1.0 - 0.5 * steps)
-    whole = sum(float(np.sum(r.force_measured[UNSETTLED:] ** 2)) for r in records if r.force_measured is not None)
-    share = np.sqrt(odd / max(whole, 1e-300))
+    scaled = whole - measured * (measured @ whole) / max(float(measured @ measured), 1e-300)
+    share = np.sqrt(_steady(np.split(scaled, ends)) / max(float(measured @ measured), 1e-300))
     strays = ""
     if share > STRAYS:
         strays = (
@@ -234,8 +239,16 @@ def _judged(records: list[Record], found: list[Finding], left: list[Array], dt: 
             "measured force is something else (a supply that gives less at speed, a limit of its rate of change?); "
             "describe force_measured as force to see the mechanics by what the drive did"
         )
-    doubted = odd > DOUBTED * sum(float(e @ e) for e in _left(records, 0.0, 0.0, np.inf, dt))
+    none = np.concatenate(_left(records, 0.0, 0.0, np.inf, dt))
+    doubted = odd > DOUBTED * len(none) * float(np.var(none))
     return [replace(f, doubted=doubted) for f in found], strays
+
+
+def _steady(left: list[Array]) -> float:
+    """Return the squares of what goes on from row to row; 0 of noise."""
+    rows, squares = sum(map(len, left)), max(sum(float(e @ e) for e in left), 1e-300)
+    steps = sum(float(np.sum(np.diff(e) ** 2)) for e in left) / squares  # 2 of white noise, by 2 over the root of rows
+    return 0.0 if steps > 2.0 - max(STEADY_ROWS, COLOURED / np.sqrt(rows)) else squares * (1.0 - 0.5 * steps)
 
 
 def _left(records: list[Record], delay: float, lag: float, limit: float, dt: float) -> list[Array]:

@@ -120,16 +120,18 @@ def _times(r: Record) -> Array:
 def _fresh(r: Record) -> Record:
     """Return the rows of their own instant; those that repeat the one before, while it moves, are old news.
 
-    That it moves is seen where it passes more than two steps of the encoder a row: slower motion repeats rows anyway.
+    That a device has no news is seen where it passes more than two steps of the encoder a row: slower motion repeats
+    rows anyway. Of a device that is seen so, they are old news in slower motion as well.
     """
     rows = r.only(np.concatenate([[True], np.diff(_times(r)) != 0.0]))
     values = [a for a in (rows.position, rows.force, rows.force_measured) if a is not None]
     again = np.concatenate([[False], np.all([np.diff(a) == 0.0 for a in values], axis=0)])
     x = np.pad(rows.position, ROUND, mode="edge")
+    passed = np.abs(x[2 * ROUND :] - x[: -2 * ROUND])
     moved = np.abs(np.diff(rows.position))
     steps = moved[moved > ROUNDED * np.ptp(rows.position)]
-    old = again & (np.abs(x[2 * ROUND :] - x[: -2 * ROUND]) > 4.0 * ROUND * np.min(steps, initial=np.inf))
-    return rows.only(~old) if np.mean(old) > STALE else rows
+    stale = np.mean(again & (passed > 4.0 * ROUND * np.min(steps, initial=np.inf)))
+    return rows.only(~(again & (passed > 0.0))) if stale > STALE else rows
 
 
 def foretold(t: Array, x: Array) -> Array:

@@ -212,7 +212,8 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
     )
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
-    notes = list(dict.fromkeys([*notes, *check_scale(problem, nominal)]))
+    if not nominal.imposed:  # the inertia is as large as fits
+        notes = list(dict.fromkeys([*notes, *check_scale(problem, nominal)]))
     problem = noise_read(problem, model)
     for _ in range(TRUSTED if points else 0):
         problem = noise_read(trusted(problem, model), model)

@@ -69,8 +69,69 @@ def test_a_damper_that_is_as_stated_lacks_nothing() -> None:
 
 def test_what_never_changes_is_refused() -> None:
     still = Record("still", np.zeros(2000), np.full(2000, 3.0))
-    with pytest.raises(BadInputError, match="never changes"):
+    with pytest.raises(BadInputError, match="force never changes"):
         reconcile.analyse(Session((still,)), RIG)
+    even = Record("even", STEP * np.round(0.02 * DT * np.arange(4000) / STEP), still_noise())
+    with pytest.raises(BadInputError, match="speed never changes"):
+        reconcile.analyse(Session((even,)), RIG)
+
+
+def still_noise() -> Array:
+    return 3.0 + 0.01 * np.random.default_rng(4).standard_normal(4000)
+
+
+def swung(law: Law, step: float = STEP) -> Session:
+    """One sine for each record, at which place and acceleration are one column."""
+    t, w = DT * np.arange(6000), np.pi
+    records = []
+    for i, size in enumerate((0.05, 0.02)):
+        x, v, a = size * np.sin(w * t), size * w * np.cos(w * t), -size * w**2 * np.sin(w * t)
+        force = law(x, v, a)
+        noise = np.random.default_rng(i).normal(scale=0.02 * np.std(force), size=len(t))
+        records.append(Record(f"sine {i}", step * np.round(x / step), force + noise, time_s=t))
+    return Session(tuple(records))
+
+
+@pytest.mark.parametrize(
+    ("law", "expected"),
+    [
+        (lambda x, v, a: 3.0 * np.sign(v) + 20.0 * v, {"coulomb": {"Fc": 3.0}, "viscous": {"b_extra": 20.0}}),
+        (lambda x, v, a: 200.0 * x, {"spring": {"k": 200.0}}),
+    ],
+    ids=["friction", "spring"],
+)
+def test_one_sine_is_enough(law: Law, expected: dict[str, dict[str, float]]) -> None:
+    verdict = reconcile.analyse(swung(law), RIG)
+    assert verdict.outcome is Outcome.NAMED
+    found = {e.name: {p.symbol: p.value for p in e.parameters} for e in verdict.effects}
+    assert found == {name: pytest.approx(numbers, rel=5e-3) for name, numbers in expected.items()}
+
+
+def test_steps_of_a_coarse_encoder_are_no_friction_at_low_speed() -> None:
+    session = moved(lambda x, v, a: 3.0 * np.sign(v) + 20.0 * v, 34)
+    coarse = tuple(replace(r, position=1e-3 * np.round(r.position / 1e-3)) for r in session.records)
+    with pytest.raises(BadInputError, match="finer sensor of position"):
+        reconcile.analyse(Session(coarse), RIG)
+
+
+def test_a_force_of_the_other_sign_is_refused() -> None:
+    for law in (lambda x, v, a: -40.0 * v - 3.0 * np.sign(v), lambda x, v, a: -40.0 * v - 200.0 * x):
+        with pytest.raises(BadInputError, match="drives the motion"):
+            reconcile.analyse(moved(law, 21), RIG)
+
+
+def test_records_that_are_none_are_told_as_such() -> None:
+    good, other = moved(lambda x, v, a: 40.0 * v, 5).records
+    damaged = {
+        "no numbers": replace(other, position=np.where(np.arange(8000) % 3 == 1, np.nan, other.position), time_s=None),
+        "samples are too few": replace(other.cut(0, 2), time_s=None),
+        "force has 7999 samples": replace(other, force=other.force[1:]),
+    }
+    for said, bad in damaged.items():
+        with pytest.raises(BadInputError, match=said):
+            reconcile.analyse(Session((good, bad)), RIG)
+    with pytest.raises(BadInputError, match="there are none"):
+        reconcile.analyse(Session(()), RIG)
 
 
 def test_effects_of_a_drive_do_not_apply_to_a_rig() -> None:

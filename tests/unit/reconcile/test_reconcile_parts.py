@@ -133,6 +133,21 @@ def test_a_drive_of_a_limited_rate_of_change_is_no_sure_lag(most: float, is_litt
     assert (strays == "") is is_little
 
 
+@pytest.mark.parametrize(("zero", "scale"), [(0.0, 0.93), (0.02, 1.0), (-0.02, 1.06)])
+def test_zero_and_scale_of_the_measured_force_doubt_no_drive(zero: float, scale: float) -> None:
+    rng = np.random.default_rng(9)
+    force = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]) + 0.1 * rng.standard_normal(2000)
+    place = 1e-3 * np.arange(2000)
+    for lag_s, expected in ((3e-3, ["lag"]), (0.0, [])):
+        measured = zero + scale * drive_output(force, 0.0, lag_s, np.inf, 1e-3) + 2e-3 * rng.standard_normal(2000)
+        found, strays = drive(Session((Record("sensor", place, force, place, measured),)), AXIS)
+        assert not strays
+        if scale == 1.0:
+            assert [f.effect for f in found] == expected and not any(f.doubted for f in found)
+        else:
+            assert all(f.doubted for f in found), "a scale looks like a lag"
+
+
 def test_a_supply_that_gives_less_at_speed_is_no_limit_of_the_drive() -> None:
     rng = np.random.default_rng(8)
     force, speed = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]), 0.3 * np.sin(2.0 * np.pi * 1.5 * T[:2000] - 0.6)

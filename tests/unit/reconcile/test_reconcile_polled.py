@@ -11,7 +11,7 @@ from sioms.reconcile.axis import analyse
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.halves import NOTHING
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.polled import evened, foretold
+from sioms.reconcile.polled import _fresh, evened, foretold
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.simulate import pack, released
@@ -166,3 +166,16 @@ def test_columns_of_half_the_rows_are_told_whatever_the_steps() -> None:
         analyse(
             Session((replace(log, force=log.force[::2]),)), AxisModel(False, STEP_S, 1.0, 0.1, 1e-6, 0.01, 9.0, 1.0)
         )
+
+
+@pytest.mark.parametrize("size", [0.1, 0.003, 0.001])
+def test_rows_of_a_device_without_news_are_left_out_in_slow_motion_as_well(size: float) -> None:
+    """News every 20 ms, read every 10; where it turns round the encoder of 10 um passes less than a step a row."""
+    rng = np.random.default_rng(1)
+    t = np.cumsum(STEP_S * rng.uniform(0.7, 1.3, 1900))
+    number = np.floor(t / 0.02).astype(int)
+    news = 0.02 * np.arange(number[-1] + 1)
+    x = 1e-5 * np.round(size * (np.sin(np.pi * news) + 0.3 * np.sin(2.2 * np.pi * news)) / 1e-5)
+    u = force(news) + 0.05 * rng.standard_normal(len(news))
+    fresh = _fresh(Record("log", x[number], u[number], time_s=t))
+    assert len(fresh) < 1.08 * len(news)
