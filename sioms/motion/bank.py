@@ -358,8 +358,10 @@ class Bank(ABC):
 
     def _abandon(self, axes: Axes, now_ns: int, errno_: int, text: str, *, fastest: bool = False) -> None:
         """Stop axes for a reason that is not their writer's, and tell those who wait for them."""
+        written = [c.axis for write in self._written for c in write.commands]
+        unfinished = ~self._idle(axes) | np.isin(axes, written)
         self._forget(axes)
-        self._queue.emit(EventKind.DROPPED, axes[~self._idle(axes)], now_ns, errno_, text)
+        self._queue.emit(EventKind.DROPPED, axes[unfinished], now_ns, errno_, text)
         self._halt(axes, self._instant(now_ns), fastest=fastest)
 
     def abandon(self, axes: AxesLike, now_ns: int, errno_: int, text: str) -> None:

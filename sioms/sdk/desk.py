@@ -85,7 +85,14 @@ class WriteDesk:
             handle
             for handle in self._clients.writers
             if handle.block is block
-            and not (handle.writing or handle.waits or handle.ahead[1] or handle.halted or handle.is_in_doubt)
+            and not (
+                handle.writing
+                or handle.waits
+                or handle.ahead[1]
+                or handle.halted
+                or handle.is_in_doubt
+                or handle.cut_short
+            )
         ][:MOST_WRITERS]
         if writers != self._writers:
             self._list(writers)

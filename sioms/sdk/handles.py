@@ -112,6 +112,8 @@ class Handle:
         halted: whether what it owns has been stopped because it ends.
         queued_bytes: how much of what lay in its socket when a reset was seen lies there still.
         reset_ns: when what it shows was reset last [ns, CLOCK_MONOTONIC].
+        cut_short: errno and reason by axis, where its motion was ended for a reason of others while it waited for
+            nothing: its next wait is told.
     """
 
     number: int
@@ -143,12 +145,18 @@ class Handle:
     halted: bool = False
     queued_bytes: int = 0
     reset_ns: int = 0
+    cut_short: dict[int, tuple[int, str]] = field(default_factory=dict)
     writes: bool = field(init=False)
     axes: list[int] = field(init=False)
 
     def __post_init__(self) -> None:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
         self.axes = self.channels.tolist()
+
+    def begins_anew(self, axes: Iterable[int]) -> None:
+        """Note that it has something else done with axes: how what it did before has ended tells nothing any more."""
+        for axis in axes:
+            self.cut_short.pop(axis, None)
 
     def note_reset(self, at_ns: int) -> None:
         """Note that what it shows has been reset [ns, CLOCK_MONOTONIC]: of what comes from before it matters when that
@@ -353,15 +361,15 @@ class Waits:
         if wait in self._of.get(wait.handle.uid, ()) and wait.refusal is None:
             self._refuse(wait, errno_, text)
 
-    def end_where(self, condition: Callable[[Wait], bool], errno_: int, text: str) -> int:
-        """End all waits that a condition holds for; return how many.
+    def end_where(self, condition: Callable[[Wait], bool], errno_: int, text: str) -> list[Wait]:
+        """End all waits that a condition holds for; return them.
 
         Nothing of them happens any more; beyond a few of each user, they are told so after the next publications.
         """
-        ended = 0
+        ended: list[Wait] = []
         for waiting in list(self._of.values()):
             mine = [wait for wait in waiting if wait.refusal is None and condition(wait)]
-            ended += len(mine)
+            ended += mine
             for wait in mine[: self.a_look]:
                 self._refuse(wait, errno_, f"{wait.what}: {text}")
             for wait in mine[self.a_look :]:
@@ -374,10 +382,10 @@ class Waits:
         """End all waits for a block."""
         self.end_where(lambda w: w.handle.block is block, errno_, text)
 
-    def end_axes(self, block: AnyBlock, axes: Iterable[int], errno_: int, text: str) -> None:
-        """End the waits for motion of some axes, and the writes to them that are not in the buffers yet."""
+    def end_axes(self, block: AnyBlock, axes: Iterable[int], errno_: int, text: str) -> list[Wait]:
+        """End the waits for motion of some axes, and the writes to them that are not in the buffers; return them."""
         ours = {int(a) for a in axes}
-        self.end_where(lambda w: w.handle.block is block and not ours.isdisjoint(w.channels), errno_, text)
+        return self.end_where(lambda w: w.handle.block is block and not ours.isdisjoint(w.channels), errno_, text)
 
     def forget(self, handle: Handle) -> None:
         """Drop the waits of a handle that is gone."""

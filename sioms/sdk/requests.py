@@ -63,6 +63,7 @@ def ioctl(
         case Request.EMERGENCY_STOP:
             source = f"{handle.who} on {handle.node}"
             service.stops.stop_node(handle.block, handle.channels, handle.bit, source, by=handle.number)
+            handle.begins_anew(handle.axes)
             return service.stops.note_node(handle, source, stop=True)
         case Request.RESET:
             if argument is not None and (type(argument) is not int or argument < 0):
@@ -72,7 +73,7 @@ def ioctl(
             return service.stops.reset_by(handle, what, sent_ns, argument, service.loop.heed)
         case Request.CANCEL_WAITS:
             ours = {int(c) for c in handle.channels}
-            return service.waits.end_where(
+            ended = service.waits.end_where(
                 lambda w: (
                     w.handle.block is handle.block
                     and w.number != number
@@ -81,6 +82,7 @@ def ioctl(
                 errno.ECANCELED,
                 f"cancelled by {handle.who}",
             )
+            return len(ended)
         case Request.GET_STATISTICS:
             if argument is not None and (type(argument) is not int or argument < 1):
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} ticks; want a number from 1, or none")
@@ -150,6 +152,9 @@ def _axis_request(
     match request:
         case Request.WAIT_UNTIL_IDLE:
             block, channels = handle.block, frozenset(axes.tolist())
+            if ended := [handle.cut_short.pop(axis) for axis in axes.tolist() if axis in handle.cut_short]:
+                errno_, text = ended[0]
+                raise _refuse(errno_, f"{what}: {text}")
 
             def is_written() -> bool:
                 return all(channels.isdisjoint(write.axes) for write in handle.writing)
@@ -175,11 +180,13 @@ def _axis_request(
         case Request.STOP:
             reason = Reason(Stop.CONTROLLED, f"stopped by {handle.who}", errno.ECANCELED)
             service.stops.safe_stop(reason, [(handle.block, axes.tolist(), -1)])
+            handle.begins_anew(axes.tolist())
         case Request.FLUSH:
             end_writes(service, handle.writing, "flushed")
             bank.flush(axes)
         case Request.HOME:
             check_link(service, handle, what)
+            handle.begins_anew(axes.tolist())
             bank.home(axes, now_ns)
         case Request.SET_LIMITS:
             bank.set_limits(axes, **_limits(argument, what))

@@ -29,7 +29,7 @@ from .alarm_watch import Rule
 from .blocks import AnyBlock, AxisBlock, BinaryBlock
 from .effects import Effects
 from .engine import Engine
-from .handles import Handle, Waits
+from .handles import Handle, Wait, Waits
 from .outputs import WHOLE, Outputs, safe_of
 from .pages import Pages
 
@@ -333,6 +333,7 @@ class Stops:
         whole = [(block, range(block.n), -1) for block in self._blocks] if parts is None else parts
         axes = [block for block, _, _ in whole if isinstance(block, AxisBlock)]
         self._effects.note()
+        told: list[Wait] = []
         steps: list[Callable[[], None]] = [partial(self._stop_axes, reason, whole)]
         if reason.stop is Stop.FAILURE:
             steps.append(partial(engine.recover, reason.text))
@@ -344,16 +345,16 @@ class Stops:
             steps += [partial(self._drop_writes, *part) for part in whole]
             steps += [partial(self.make_safe, *part) for part in whole]
         if reason.errno:  # before the events of the banks would: these know who stopped
-            steps.append(partial(self._end_waits, reason, whole))
-        steps.append(self.take_events)
+            steps.append(partial(self._end_waits, reason, whole, told))
+        steps.append(partial(self.take_events, reason.text, told))
         failures = []
         for step in steps:
             try:
                 step()
             except Exception as error:  # nothing may keep the others from being stopped
                 failures.append(error)
-        told = [] if parts is None else [[b.spec.name, [int(c) for c in channels], bit] for b, channels, bit in parts]
-        self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, told)
+        what = [] if parts is None else [[b.spec.name, [int(c) for c in channels], bit] for b, channels, bit in parts]
+        self._events.note(Note.STOP, time.monotonic_ns(), reason.stop.name, reason.text, what)
         if failures:
             raise failures[0]
 
@@ -363,18 +364,33 @@ class Stops:
         whole = [(block, range(block.n), -1) for block in blocks]
         self.safe_stop(Reason(Stop.LOSS, why, errno.EIO), whole)
 
-    def take_events(self) -> None:
-        """End the waits that events of the axes end, and report faults."""
+    def take_events(self, why: str = "", told: Sequence[Wait] = ()) -> None:
+        """End the waits that events of the axes end, and report faults.
+
+        Args:
+            why: what has stopped axes just now, if anything has; told: waits that have been told so.
+        """
         self.note_faults()
         for block in self._axes:
             for event in block.bank.take_events():
                 if event.kind in (EventKind.DROPPED, EventKind.FAULT):
                     self._effects.note()
-                    self._waits.end_axes(block, event.axes, event.errno or errno.EIO, event.text)
+                    errno_ = event.errno or errno.EIO
+                    ended = self._waits.end_axes(block, event.axes, errno_, event.text)
+                    if event.kind is EventKind.DROPPED:
+                        self._cut_short(block, event.axes, (errno_, why or event.text), [*told, *ended])
                     if event.kind is EventKind.FAULT:
                         names = ", ".join(block.spec.channels[a].name for a in event.axes[:4])
                         self._events.note(Note.FAULT, time.monotonic_ns(), names, event.text)
                         self._log("error", f"fault of {names}: {event.text}")
+
+    def _cut_short(self, block: AxisBlock, axes: Iterable[int], why: tuple[int, str], told: Sequence[Wait]) -> None:
+        """Keep for the next wait of their writers how motions have ended, but for who has been told."""
+        for handle in self._handles.values():
+            if handle.block is not block or not handle.writes:
+                continue
+            known = {axis for wait in told if wait.handle is handle for axis in wait.channels}
+            handle.cut_short |= {int(axis): why for axis in axes if axis in handle.axes and axis not in known}
 
     def _tell_fault(self, block: AxisBlock, axis: int, severity: Severity, text: str, at_ns: int = 0) -> None:
         """Tell the daemon that an axis is in fault, or is not any more."""
@@ -401,12 +417,13 @@ class Stops:
                 case Stop.LOSS:
                     block.bank.fault(axes, reason.text, now_ns)
 
-    def _end_waits(self, reason: Reason, parts: Iterable[Part]) -> None:
+    def _end_waits(self, reason: Reason, parts: Iterable[Part], told: list[Wait]) -> None:
+        """End the waits for what is stopped; those for motion are added to ``told``."""
         for block, channels, _ in parts:
             if reason.stop is Stop.LOSS:
                 self._waits.end_block(block, reason.errno, reason.text)
             elif isinstance(block, AxisBlock):
-                self._waits.end_axes(block, channels, reason.errno, reason.text)
+                told += self._waits.end_axes(block, channels, reason.errno, reason.text)
 
     # --- nodes -----------------------------------------------------------------------------------
 

@@ -61,6 +61,8 @@ def write(service: Service, handle: Handle, number: int, flags: int, timeout_s: 
         raise OSError(errno.EPERM, f"{what}: stopped by emergency stop ({service.stops.source}); reset first")
     check_link(service, handle, what)
     if isinstance(block, AxisBlock):
+        if handle.cut_short:
+            handle.begins_anew([handle.axes[r[0]] for r in record.iter_unpack(data) if 0 <= r[0] < len(handle.axes)])
         if block.admits is not None:
             try:
                 block.admits(list(record.iter_unpack(data)), handle.axes)

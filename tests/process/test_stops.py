@@ -321,6 +321,43 @@ def test_a_driver_that_restarts_during_a_stop_is_stopped(daemon: Daemon, cell: s
         axis.move(0.1)
 
 
+@pytest.mark.parametrize("after_s", [0.0, 0.1])
+@pytest.mark.parametrize("how", ["workcell", "node", "limit"])
+def test_a_motion_that_others_have_ended_is_told_to_a_wait_that_comes_later(
+    daemon: Daemon, cell: sioms.Workcell, how: str, after_s: float
+) -> None:
+    """Between its write and its wait a program may be busy; that its axis rests does not mean that it has arrived."""
+    with daemon.cell() as other, cell.open("mod0", "rw") as arm:
+        expected: tuple[int, str] = (errno.ECANCELED, "emergency stop by")
+        if how == "limit":
+            arm.set_limits(position_max=[arm.read().position[0] + 0.02, 1.0])
+            expected = errno.ERANGE, "limit"
+        arm["xaxis"].jog(0.05)
+        time.sleep(after_s)
+        match how:
+            case "workcell":
+                other.emergency_stop()
+            case "node":
+                other.emergency_stop("mod0")
+        wait_for(lambda: not any(arm.read().in_motion), "the axes at rest")
+        with raises(expected[0], expected[1]):
+            arm.wait_until_idle(timeout=5.0)
+        arm.wait_until_idle(timeout=5.0)
+        if how == "limit":
+            arm.set_limits(position_max=None)
+        else:
+            other.reset(*["mod0"][how == "workcell" :])
+        arm["xaxis"].move(arm.read().position[0] - 0.01)
+        arm.wait_until_idle(timeout=5.0)
+        arm["xaxis"].jog(-0.05)
+        arm.stop()
+        arm.wait_until_idle(timeout=5.0)
+        arm["xaxis"].jog(0.05)
+        arm.emergency_stop()
+        arm.wait_until_idle(timeout=5.0)
+        arm.reset()
+
+
 def test_controlled_stop_is_not_latched(cell: sioms.Workcell) -> None:
     with cell.open("mod0.xaxis", "rw") as axis:
         _fill(axis)

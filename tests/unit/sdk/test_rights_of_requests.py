@@ -40,6 +40,8 @@ def test_a_request_takes_its_right(request_: Request) -> None:
             bit=0,
             number=1,
             passed_on=False,
+            axes=[0],
+            begins_anew=lambda axes: None,
         )
         runtime: Any = MagicMock()
         try:

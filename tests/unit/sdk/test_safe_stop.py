@@ -37,7 +37,7 @@ class Device:
             drop_writes=self.note("writes"),
         )  # fmt: skip
         outputs: Any = SimpleNamespace(want=lambda *_: None, forget=self.note("outputs are forgotten"))
-        waits: Any = SimpleNamespace(end_axes=self.note("waits"), end_block=self.note("all waits"))
+        waits: Any = SimpleNamespace(end_axes=lambda *_: self.note("waits")() or [], end_block=self.note("all waits"))
         latch: Any = SimpleNamespace(resets=0, orders=0, ended_stop_ns=0)
         nothing: Any = SimpleNamespace(mark=0)
         self.stops = Stops(
