@@ -322,12 +322,14 @@ class AxisVerbs(NodeVerbs[AxisSnapshot]):
     async def wait_until_idle(self, timeout: float | None = None, axis: int | str | None = None) -> None:
         """Wait until axes stand still and their buffers are empty.
 
+        A motion of this node that others, a limit or a fault have ended before the wait was asked for is told, once.
+
         Args:
             timeout: how long at most [s]; None: for ever.
             axis: index or name of one axis; None: all of the node.
 
         Raises:
-            OSError: ETIMEDOUT; ECANCELED stopped; EIO fault; EPIPE a marker waited for was freed.
+            OSError: ETIMEDOUT; ECANCELED stopped; EIO fault; ERANGE a limit; EPIPE a marker waited for was freed.
         """
         await self._ask(Request.WAIT_UNTIL_IDLE, self._one(axis), timeout)
 

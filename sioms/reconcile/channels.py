@@ -18,7 +18,7 @@ from sioms.reconcile.effect import Array
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.thresholds import COLOURED, DOUBTED, STEADY_ROWS, STRAYS
+from sioms.reconcile.thresholds import COLOURED, DOUBTED, GOES_WITH, STEADY_ROWS, STRAYS
 
 LATTICE_SHARE = 0.998
 #: A scale or a drive effect must be this many standard errors away from nothing ...
@@ -31,6 +31,8 @@ FOREIGN_FORCE = 0.5
 LATEST = 20.0
 #: First samples of a record, not compared: what was commanded before them is not known.
 UNSETTLED = 20
+#: Samples back at which a command may still tell what a drive does.
+PAST = (0, 1, 2, 4, 8, 16)
 #: Step of a slope over a time, in samples.
 STEP = 0.05
 
@@ -233,7 +235,7 @@ def _judged(records: list[Record], found: list[Finding], left: list[Array], dt: 
     scaled = whole - measured * (measured @ whole) / max(float(measured @ measured), 1e-300)
     share = np.sqrt(_steady(np.split(scaled, ends)) / max(float(measured @ measured), 1e-300))
     strays = ""
-    if share > STRAYS:
+    if share > STRAYS and _of_command(records, whole) > GOES_WITH:
         strays = (
             f"the drive does not follow its command by a delay, a lag and a limit alone: {100 * share:.0f} % of the "
             "measured force is something else (a supply that gives less at speed, a limit of its rate of change?); "
@@ -242,6 +244,19 @@ def _judged(records: list[Record], found: list[Finding], left: list[Array], dt: 
     none = np.concatenate(_left(records, 0.0, 0.0, np.inf, dt))
     doubted = odd > DOUBTED * len(none) * float(np.var(none))
     return [replace(f, doubted=doubted) for f in found], strays
+
+
+def _of_command(records: list[Record], left: Array) -> float:
+    """Return the share of what a drive leaves that goes with its command, present and past; little of any noise."""
+
+    def seen(u: Array) -> Array:
+        past = [np.concatenate([np.zeros(k), u])[: len(u)] for k in PAST]
+        columns = [f(p) for p in past for f in (np.asarray, np.abs, lambda p: p * np.abs(p))]
+        return np.stack(columns, axis=1)[UNSETTLED:]
+
+    columns = np.concatenate([seen(r.force) for r in records if r.force_measured is not None])
+    of_it = columns @ np.linalg.lstsq(columns, left, rcond=None)[0]
+    return float(of_it @ of_it) / max(float(left @ left), 1e-300)
 
 
 def _steady(left: list[Array]) -> float:

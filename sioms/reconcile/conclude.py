@@ -122,7 +122,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
-    beyond = ratio > (LARGE if named or terms else LOUD)
+    beyond = ratio > (LARGE if named or terms or ready.points else LOUD)
     if runs_away(found.fit.model):
         judged = replace(judged, refusals=(*judged.refusals, _of_inertia(nominal, found.fit.model)))
     if ready.strays:

@@ -148,6 +148,19 @@ def test_zero_and_scale_of_the_measured_force_doubt_no_drive(zero: float, scale:
             assert all(f.doubted for f in found), "a scale looks like a lag"
 
 
+@pytest.mark.parametrize("what", ["filtered", "hum"])
+def test_noise_of_the_current_that_has_a_colour_is_no_law_of_the_drive(what: str) -> None:
+    """It may doubt a lag, but it does not go with the command: of the mechanics everything can be told."""
+    rng = np.random.default_rng(9)
+    force = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]) + 0.1 * np.sign(np.sin(2.0 * np.pi * 3.7 * T[:2000]))
+    noise = np.convolve(rng.standard_normal(2000), np.exp(-np.arange(60) / 12.0), "same")
+    noise = np.sin(2.0 * np.pi * 50.0 * T[:2000]) if what == "hum" else noise
+    measured = force + 0.03 * noise / np.std(noise)
+    place = 1e-3 * np.arange(2000)
+    found, strays = drive(Session((Record("rough", place, force, place, measured),)), AXIS)
+    assert strays == "" and all(f.doubted for f in found)
+
+
 def test_a_supply_that_gives_less_at_speed_is_no_limit_of_the_drive() -> None:
     rng = np.random.default_rng(8)
     force, speed = 0.4 * np.sin(2.0 * np.pi * 1.5 * T[:2000]), 0.3 * np.sin(2.0 * np.pi * 1.5 * T[:2000] - 0.6)
