@@ -144,10 +144,10 @@ class Cut:
 
 
 @pytest.fixture
-def cut(monkeypatch: pytest.MonkeyPatch) -> Iterator[Cut]:
+def cut() -> Iterator[Cut]:
     sent: list[int] = []
-    with cells() as make:
-        monkeypatch.setattr(Timestamps, "monotonic_ns", lambda *_: sent[0] if sent else CLOCK())
+    with cells() as make, pytest.MonkeyPatch.context() as patch:  # undone before what the cells have patched is
+        patch.setattr(Timestamps, "monotonic_ns", lambda *_: sent[0] if sent else CLOCK())
         yield Cut(make(), sent)
 
 
