@@ -27,17 +27,9 @@ from sioms.hand.touch import Failed, Fault, Manner, Reading, Sensed, Setpoint, S
 
 
 class Skills(Feeling):
-    """Skills of one hand.  One at a time.
-
-    Args:
-        hand: its modules.
-        first: what is read of it at the start.
-        manner: how it does it.
+    """Skills of one hand.  One at a time; arguments, state, events and readings as of ``Motions``.
 
     Attributes:
-        state: where it is.
-        events: what it had to say.
-        now: the last reading.
         regrasps, rolls: how many it made.
         sensed: called after each grasp that was sensed.
     """

@@ -195,8 +195,17 @@ def test_what_was_under_way_at_a_stop_and_its_reset_is_not_carried_out(
             axis.command(velocity=0.01)  # who knows of the reset is not refused
 
 
+WAYS = ["of the cell", "of the node", "by a reader", "of the workcell"]
+
+
+def resets(far: sioms.Workcell, axis: sioms.AxisNode, reader: sioms.AxisNode) -> dict[str, Callable[[], object]]:
+    """Return the ways to reset mod1 from another machine."""
+    ways = (lambda: far.reset("mod1"), axis.reset, reader.reset, far.reset)
+    return dict(zip(WAYS, ways, strict=True))
+
+
 @pytest.mark.parametrize("again", ["by the daemon", "on a handle"])
-@pytest.mark.parametrize("way", ["of the cell", "of the node", "by a reader", "of the workcell"])
+@pytest.mark.parametrize("way", WAYS)
 def test_a_reset_that_was_under_way_leaves_a_later_stop(
     daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str, again: str
 ) -> None:
@@ -205,10 +214,7 @@ def test_a_reset_that_was_under_way_leaves_a_later_stop(
         far.open("mod1.readonly") as reader,
         cell.open("mod1.readonly") as seen,
     ):
-        reset = {
-            "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "by a reader": reader.reset,
-            "of the workcell": lambda: far.reset(),
-        }[way]  # fmt: skip
+        reset = resets(far, axis, reader)[way]
         name = "" if way == "of the workcell" else "mod1"
         cell.emergency_stop(name)
         wait_for(lambda: axis.read().status[0] & AxisStatus.EMERGENCY_STOP, "the client to see the first stop")
@@ -226,7 +232,7 @@ def test_a_reset_that_was_under_way_leaves_a_later_stop(
         wait_for(lambda: not seen.read().status[0] & AxisStatus.EMERGENCY_STOP, "reset")
 
 
-@pytest.mark.parametrize("way", ["of the cell", "of the node", "by a reader", "of the workcell"])
+@pytest.mark.parametrize("way", WAYS)
 def test_a_reset_of_who_has_not_heard_since_a_fault_is_refused(
     daemon: Daemon, gate: Gateway, cell: sioms.Workcell, way: str
 ) -> None:
@@ -236,10 +242,7 @@ def test_a_reset_of_who_has_not_heard_since_a_fault_is_refused(
         far.open("mod1.readonly") as reader,
         cell.open("mod1.readonly") as seen,
     ):
-        reset = {
-            "of the cell": lambda: far.reset("mod1"), "of the node": axis.reset, "by a reader": reader.reset,
-            "of the workcell": lambda: far.reset(),
-        }[way]  # fmt: skip
+        reset = resets(far, axis, reader)[way]
         axis.command(velocity=1.0, max_force=1e-3)
         relay.treat(stalled=True)
         wait_for(lambda: seen.read().status[0] & AxisStatus.FAULT, "in fault")
