@@ -78,9 +78,9 @@ COLOURED, STEADY_ROWS, DOUBTED, STRAYS, GOES_WITH = 8.0, 0.1, 0.003, 0.05, 0.3
 """What a drive's law leaves is no noise where its steps from row to row have less than twice its squares by the second,
 and by the first over the root of the rows (four standard errors of white noise). The law is doubted where that is above
 the third share of what no law leaves, and of the mechanics nothing can be told above the fourth share of the force, if
-the last share of it goes with the command: 0.56 to 0.97 of such drives, 0.01 of noise of any colour. Forty drawn
-axes: 1.92 to 2.02 where the law holds; 0.001 to 0.12 of a supply that gives less at speed, 0.03 to 1.86 of a limited
-rate of change (1006)."""
+the last share of it goes with the command: 0.56 to 0.97 of such drives, 0.03 at most of coloured noise and hum. Forty
+drawn axes: 1.92 to 2.02 where the law holds; 0.001 to 0.12 of a supply that gives less at speed, 0.03 to 1.86 of a
+limited rate of change (1006)."""
 LOCKED, MOSTLY_LOCKED = 0.02, 0.2
 """Something is missing where this share of the residual is one wave locked to the place; beside what is named, where it
 is the second. Thirty-five drawn axes without one: 0.008 at most, of an encoder coarser than stated; 0.028 to 0.77 of an
