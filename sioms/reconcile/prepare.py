@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -61,6 +62,15 @@ class Options:
     envelope: Envelope | None = None
     without: tuple[str, ...] = ()
     progress: Callable[[str], None] = field(default=lambda text: None)
+
+
+def quiet(mapper: Mapper) -> Mapper:
+    """Return that mapper with no warning of numbers that overflow in its trials: numpy has that setting per thread."""
+
+    def mapped(trial: Callable[[Any], Any], over: Iterable[Any]) -> Iterable[Any]:
+        return mapper(np.errstate(over="ignore", invalid="ignore")(trial), over)
+
+    return mapped
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,7 +221,7 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
         ),
     )
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
-    problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=o.mapper)
+    problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=quiet(o.mapper))
     if not nominal.imposed:  # the inertia is as large as fits
         notes = list(dict.fromkeys([*notes, *check_scale(problem, nominal)]))
     problem = noise_read(problem, model)

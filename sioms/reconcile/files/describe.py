@@ -6,7 +6,7 @@ the others. What is not certain stands as a question in the draft, which then ca
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,31 +68,37 @@ class Draft:
 
 
 def describe(data: Path) -> Draft:
-    """Look at a file, or the first of a folder.
+    """Look at a file, or all of a folder: columns are those of the first, what is largest is that of all.
 
     Raises:
-        BadInputError: there is none that can be read.
+        BadInputError: there is none, or one of them cannot be read.
     """
     if not data.exists():
         raise BadInputError(f"describe {data}: no such file or folder")
     files = [data] if data.is_file() else sorted(p for p in data.glob("*") if p.suffix in SUFFIXES)
     if not files:
         raise BadInputError(f"describe {data}: no data files; expects one of {', '.join(SUFFIXES)}")
-    table = load_table(files[0])
-    columns = {h: a for h, a in table.columns.items() if len(a) == _rows(table)}
-    table = Table(columns, table.units, table.texts)
+    table, *others = (_of_rows(load_table(f)) for f in files)
     guesses = guessed(table)
     step, said = _step(table, guesses)
     questions = [*said, *_questions(guesses)]
     questions += [f"what is {h!r}? It is of text ({t[:30]!r}); it is left out." for h, t in table.texts.items()]
-    model, asked = _model(table, guesses, step)
+    for file, other in zip(files[1:], others, strict=True):
+        lacks = [g.head for g in guesses if g.quantity is not None and g.head not in other.columns]
+        if lacks:
+            questions.append(
+                f"is {file.name} another kind of record? It has no column {', '.join(map(repr, lacks))}, "
+                f"as {files[0].name} has."
+            )
+    model, asked = _model([table, *others], guesses, step)
     return Draft(_columns(guesses, step), model, (*questions, *asked))
 
 
-def _rows(table: Table) -> int:
-    """Rows that most columns have: constants and names may lie beside them."""
+def _of_rows(table: Table) -> Table:
+    """Return the columns with as many rows as most have: constants and names may lie beside them."""
     sizes = [len(a) for a in table.columns.values()]
-    return max(set(sizes), key=lambda n: (n > 1, sizes.count(n), n)) if sizes else 0
+    rows = max(set(sizes), key=lambda n: (n > 1, sizes.count(n), n)) if sizes else 0
+    return Table({h: a for h, a in table.columns.items() if len(a) == rows}, table.units, table.texts)
 
 
 def guessed(table: Table) -> list[Guess]:
@@ -240,7 +246,7 @@ def _columns(guesses: list[Guess], step: float | None) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _model(table: Table, guesses: list[Guess], step: float | None) -> tuple[str, tuple[str, ...]]:
+def _model(tables: list[Table], guesses: list[Guess], step: float | None) -> tuple[str, tuple[str, ...]]:
     """Draft the model: what the records show, the rest as questions."""
     by = {g.quantity: g for g in guesses if g.quantity is not None}
     kinds = {measures(g.unit) for q in ("position", "force") if (g := by.get(q)) is not None and g.unit}
@@ -262,10 +268,10 @@ def _model(table: Table, guesses: list[Guess], step: float | None) -> tuple[str,
     line("viscous", "0.0", "N s/m or N m s/rad; 0 where it is not known: it is then named")
     line("pitch", None, "m or rad: lead of the screw or a turn; the period of what is periodic")
     force, place = by.get("force"), by.get("position")
-    top = _si(table, force) if force is not None else None
-    line("rated_force", f"{top:.4g}" if top else None, "continuous force; here the largest in the record")
-    speed = _speed(table, place, step) if place is not None and step else None
-    line("max_speed", f"{speed:.4g}" if speed else None, "m/s or rad/s; here the largest in the record")
+    top = _largest(_si(t, force) for t in tables) if force is not None else None
+    line("rated_force", f"{top:.4g}" if top else None, "continuous force; here the largest in the records")
+    speed = _largest(_speed(t, place, step) for t in tables) if place is not None and step else None
+    line("max_speed", f"{speed:.4g}" if speed else None, "m/s or rad/s; here the largest in the records")
     if place is not None and place.unit == "count":
         line("resolution", None, "m or rad in a count")
     return "\n".join(lines) + "\n", tuple(asked)
@@ -278,14 +284,19 @@ def _factor(unit: str | None) -> float | None:
     return UNITS[measures(unit)][unit]
 
 
+def _largest(found: Iterable[float | None]) -> float | None:
+    """Return the largest of those that are known."""
+    return max((x for x in found if x is not None), default=None)
+
+
 def _si(table: Table, g: Guess) -> float | None:
-    factor = _factor(g.unit)
-    return None if factor is None else float(np.nanmax(np.abs(table.columns[g.head]))) * factor
+    factor, x = _factor(g.unit), table.columns.get(g.head)
+    return None if factor is None or x is None else float(np.nanmax(np.abs(x))) * factor
 
 
 def _speed(table: Table, g: Guess, step: float) -> float | None:
     factor, n = _factor(g.unit), 5
-    x = table.columns[g.head]
-    if factor is None or len(x) <= n:
+    x = table.columns.get(g.head)
+    if factor is None or x is None or len(x) <= n:
         return None
     return float(np.nanmax(np.abs(x[n:] - x[:-n]))) * factor / (n * step)

@@ -24,10 +24,13 @@ WORDS = {
         "pos", "position", "enc", "encoder", "angle", "actual", "ist", "qm", "counts", "theta", "phi", "displacement",
         "disp", "deflection", "rotation", "stroke", "winkel", "weg", "place",
     ),
-    "force_measured": ("current", "cur", "iq", "measured", "meas", "strom", "loadcell"),
+    "force_measured": (
+        "current", "cur", "iq", "amp", "amps", "ampere", "amperes", "measured", "meas", "strom", "courant", "corriente",
+        "loadcell",
+    ),
     "force": (
-        "force", "torque", "effort", "out", "output", "tau", "moment", "voltage", "vir", "pwm", "duty", "kraft",
-        "drehmoment", "spannung",
+        "force", "torque", "effort", "out", "output", "tau", "moment", "voltage", "volt", "volts", "vir", "pwm", "duty",
+        "kraft", "drehmoment", "spannung", "fuerza",
     ),
     "index": ("index", "mark"),
 }  # fmt: skip

@@ -85,6 +85,22 @@ def test_a_voltage_is_no_speed_and_its_scale_is_explained(tmp_path: Path) -> Non
     assert "k_t/R" in asked and "back-EMF" in asked
 
 
+def test_the_largest_of_all_records_is_drafted(tmp_path: Path) -> None:
+    for name, scale, last in (("a", 1.0, "F [N]"), ("b", 3.0, "F [N]"), ("c", 2.0, "load")):
+        rows = "\n".join(f"{t:.6g},{scale * x:.9f},{scale * u:.6f}" for t, x, u in zip(T, X, U, strict=True))
+        (tmp_path / f"{name}.csv").write_text(f"t [s],x [m],{last}\n{rows}\n")
+    draft = describe(tmp_path)
+    axis = tomllib.loads(draft.model)["axis"]
+    assert axis["rated_force"] == pytest.approx(3.0 * np.abs(U).max(), rel=1e-3)
+    assert axis["max_speed"] == pytest.approx(3.0 * np.abs(X[5:] - X[:-5]).max() / (T[5] - T[0]), rel=1e-3)
+    assert "is c.csv another kind of record? It has no column 'F [N]', as a.csv has." in draft.questions
+
+
+def test_volts_and_amps_are_words_of_a_drive() -> None:
+    found = quantities({"t": T, "x": X, "volts": U, "motor amps": U})
+    assert (found["volts"], found["motor amps"]) == ("force", "force_measured")
+
+
 def test_what_is_not_known_is_asked_and_the_draft_is_not_used_before(tmp_path: Path) -> None:
     np.savez(tmp_path / "run.npz", t=T, pos=X, u=U, other=np.random.default_rng(1).normal(size=2000))
     draft = describe(tmp_path)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import warnings
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -25,6 +27,7 @@ from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.plausible import leans, unspecific
+from sioms.reconcile.prepare import quiet
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.refuse import loud_turns
 from sioms.reconcile.screen import screen
@@ -605,3 +608,11 @@ def test_the_plain_path_gives_the_same_numbers() -> None:
     assert [o[0] for o in out] == ["True", "False"]
     assert float(out[0][1]) == pytest.approx(float(out[1][1]), rel=1e-9)
     assert out[0][2] == out[1][2]
+
+
+def test_trials_that_overflow_are_quiet_in_every_thread() -> None:
+    huge = np.array([1e308])
+    with ThreadPoolExecutor(2) as pool, warnings.catch_warnings():
+        warnings.simplefilter("error")
+        leaves = list(quiet(pool.map)(lambda times: huge * times - huge * times, [1.0, 1e10]))
+    assert leaves[0] == 0.0 and np.isnan(leaves[1])
