@@ -208,16 +208,23 @@ class Around:
     def _smooth_outline(self) -> tuple[Array, float]:
         return Shape(self._touches).outline(), FINGER_M
 
-    def next(self, direction: float) -> Parallel | None:
-        """Return where it would be held parallel next, nearest to a direction [rad]; None where no guess is left."""
+    def next(self, direction: float, least_m: float = 0.0) -> Parallel | None:
+        """Return where it would be held parallel next, nearest to a direction [rad]; None where no guess is left.
+
+        Args:
+            direction: of the hand.
+            least_m: one that is narrower is returned only where no other is left.
+        """
         if not self._touches:
             return None
-        ways = [self._smooth, self._sided]
+        ways, narrow = [self._smooth, self._sided], None
         for way in ways if self.smooth else reversed(ways):
             for one in map(self._within, way(direction)):
                 if not self._has_tried(one):
-                    return one
-        return None
+                    if one.apart_m >= least_m:
+                        return one
+                    narrow = narrow or one
+        return narrow
 
     def _within(self, one: Parallel) -> Parallel:
         """Return a grasp so far aside at most that both fingers surely meet the object."""

@@ -15,7 +15,8 @@ from sioms.hand.kinematics import Six
 from sioms.hand.motions import LETTING_GO_N, Motions
 from sioms.hand.regrasp import NEUTRAL
 from sioms.hand.shape import Parallel, Touch
-from sioms.hand.touch import Reading, Setpoint, State
+from sioms.hand.touch import Failed, Fault, Reading, Setpoint, State
+from sioms.tactile.quality import DOUBT, Quality
 
 
 class Feeling(Motions):
@@ -44,9 +45,15 @@ class Feeling(Motions):
         yield from self._move((x, y, direction, opened, *self._goal[4:]))
         best, found = _NEARLY_RAD, None
         for many in range(self.manner.taps):
-            one, first = first or around.next(direction), None
+            one, first = first or around.next(direction, self._least_m), None
             if one is None:
                 break
+            if one.apart_m < self._least_m:
+                raise Failed(
+                    Fault.TOO_SMALL,
+                    f"{self._what}: by {self.taps - begun} touches round it {1e3 * max(one.apart_m, 0.0):.0f} mm are "
+                    f"left of it; want one wider than {1e3 * self._least_m:.0f} mm, which stays where it lies",
+                )
             target: Six = (one.x, one.y, one.direction, opened, _MIDDLE_RAD, _MIDDLE_RAD)
             if not self._reaches(target):
                 break
@@ -69,21 +76,35 @@ class Feeling(Motions):
         self.state = before
         return None if found is None else (*found, self._goal[3], NEUTRAL, NEUTRAL)
 
+    @property
+    def _least_m(self) -> float:
+        """Return the narrowest object that the hand closes on [m]."""
+        return self.manner.opening[0] - 2.0 * FINGER_M
+
     def _tap(self, index: int, near_m: float) -> Generator[Setpoint, Reading, Touch | None]:
         """Touch the object with one finger and leave it again; return what it felt, None where there is nothing.
 
         Args:
             index: of the finger.
             near_m: how far from the middle the finger is expected to meet it [m].
+
+        Raises:
+            Failed: `manner.close_s` are over, or the finger tells no place that may be relied on.
         """
         manner, side = self.manner, 0.5 - index
         u, v = math.cos(self._goal[2]), math.sin(self._goal[2])
         start, way, force = list(self._goal), 0.0, 0.0
-        rested_s, blind_s, met = 0.0, 0.0, False
-        most = 0.5 * start[3] + FINGER_M
+        rested_s, met = 0.0, False
+        most, latest_s = 0.5 * start[3] + FINGER_M, self.now.time_s + manner.close_s
         touch: Touch | None = None
-        while way < most and blind_s < _BLIND_S:
+        while way < most:
             finger, before_s = self.now.fingers[index], self.now.time_s
+            if before_s > latest_s:
+                raise Failed(
+                    Fault.DOUBTFUL,
+                    f"{self._what}: after {manner.close_s:g} s finger {index + 1} has told no place where it touches; "
+                    f"its force is {finger.force:.2f} N; want a touch of {manner.tap_n:g} N that rests, or none",
+                )
             far = 0.5 * start[3] - way > near_m + _NEAR_M
             rate = manner.moving if far else _GENTLE * manner.closing
             along: Six = (side * rate * u, side * rate * v, 0.0, -rate, 0.0, 0.0)
@@ -96,11 +117,10 @@ class Feeling(Motions):
             gone_s = self.now.time_s - before_s
             way += rate * gone_s
             force += min(gone_s / _FILTER_S, 1.0) * (self.now.fingers[index].force - force)
-            blind_s = blind_s + gone_s if finger.touched is None else 0.0
             rested_s = rested_s + gone_s if rate == 0.0 else 0.0
             if rested_s > _RESTED_S:
-                touch = yield from self._felt_by(index)
-                if touch is not None:
+                touch, presses_on = yield from self._felt_by(index)
+                if not presses_on:
                     break
                 rested_s = force = 0.0  # it rests too lightly
         self.taps += 1
@@ -130,16 +150,26 @@ class Feeling(Motions):
         """Want the hand where it is: what an object holds back is not pushed ever harder."""
         self._goal = list(self.hand.forward(self.now.joints))
 
-    def _felt_by(self, index: int) -> Generator[Setpoint, Reading, Touch | None]:
-        """Average frames of one finger; return the place and the normal, None where most frames lack them."""
+    def _felt_by(self, index: int) -> Generator[Setpoint, Reading, tuple[Touch | None, bool]]:
+        """Average frames of one finger; return the place and the normal, and whether it has to press on for them.
+
+        Without them and pressing on it rests too lightly; without both it touches beside its array.
+
+        Raises:
+            Failed: most frames say that their numbers mislead.
+        """
         points: list[tuple[float, float]] = []
         normals: list[float] = []
-        length = (self.hand.link1_m, self.hand.link2_m)[index]
-        for _ in range(_FRAMES * self.manner.frames):
+        doubts: list[str] = []
+        length, frames = (self.hand.link1_m, self.hand.link2_m)[index], _FRAMES * self.manner.frames
+        for _ in range(frames):
             self._yield()
             yield from self._follow((0.0,) * 6, 0.0)
             finger = self.now.fingers[index]
             if not finger.touched or not math.isfinite(finger.phi):
+                continue
+            if misleading := _MISLEADS.intersection(finger.doubt.split("|")):
+                doubts.append(_BESIDE if _BESIDE in misleading else min(misleading))
                 continue
             x, y, th = self.now.joints[3 * index : 3 * index + 3]
             normal = th + finger.phi
@@ -149,11 +179,19 @@ class Feeling(Motions):
             ))  # fmt: skip
             normals.append(normal)
         count = len(normals)
+        if doubts.count(_BESIDE) > frames // 2:
+            return None, False
+        if len(doubts) > frames // 2:
+            raise Failed(
+                Fault.DOUBTFUL,
+                f"{self._what}: finger {index + 1} says {doubts[-1]!r} in {len(doubts)} of {frames} frames of a touch "
+                "of its own; want a contact that its array covers",
+            )
         if count < self.manner.frames // 2:
-            return None
+            return None, True
         normal = normals[0] + sum(math.remainder(one - normals[0], math.tau) for one in normals) / count
         place = sum(x for x, _ in points) / count, sum(y for _, y in points) / count
-        return Touch(place, normal + math.pi, math.inf, math.inf)
+        return Touch(place, normal + math.pi, math.inf, math.inf), False
 
 
 _MIDDLE_RAD = math.radians(74.0)  # of an array
@@ -161,7 +199,10 @@ FITS_RAD, _NEARLY_RAD = math.radians(0.5), math.radians(4.0)
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
 _FRAMES = 2  # times those of a grasp, for lighter touches
 _CREEP = 0.3  # of the closing speed, once it has met it
-_FILTER_S, _RESTED_S, _BLIND_S = 0.03, 0.1, 0.1
+_FILTER_S, _RESTED_S = 0.03, 0.1
+_BESIDE = Quality.OUT_OF_ARC.name
+_MISLEADS = {name for name, flag in Quality.__members__.items() if flag in DOUBT & ~Quality.IMPRECISE}
+"""What a touch must not be; one so light is never precise."""
 
 
 def _held_by(touches: Sequence[Touch]) -> tuple[float, tuple[float, float, float]]:

@@ -166,6 +166,11 @@ class Motions:
         rates: Six = tuple(along)  # type: ignore[assignment]
         self.now = yield Setpoint(goal, rates, force)
         gone_s = self.now.time_s - last_s
+        if not gone_s > 0.0:  # every wait would last for ever
+            raise Failed(
+                Fault.STALE,
+                f"{self._what}: readings do not go on in time, by {gone_s:g} s; want one a tick, each later",
+            )
         if advance:
             self._goal = [at + gone_s * rate for at, rate in zip(self._goal, along, strict=True)]
         self._watch(gone_s)
@@ -182,10 +187,13 @@ class Motions:
             return
         manner = self.manner
         what = self._what
+        try:
+            self.hand.forward(self.now.joints)
+        except ValueError as error:
+            raise Failed(Fault.SINGULAR, f"{what}: {error}") from None
         for i, (finger, age_s) in enumerate(zip(self.now.fingers, self.now.ages_s, strict=True)):
             unknown = not math.isfinite(finger.force)
-            blind = finger.touched is None and self.state is not State.FEEL  # there a finger only comes and goes
-            if not age_s <= manner.stale_s or blind or unknown:
+            if not age_s <= manner.stale_s or finger.touched is None or unknown:
                 why = "its force is not known" if unknown else "it is blind"
                 if not age_s <= manner.stale_s:
                     why = f"its frame is {age_s:.2f} s old"

@@ -15,6 +15,8 @@ def carried_out(
 ) -> T:
     """Send a skill the reading of each tick until it ends; return what it found.
 
+    What ends the ticks is thrown into the skill, which names it in its events.
+
     Args:
         skill: the generator of `Skills`.
         tick: has a set-point carried out and returns the next reading.
@@ -23,16 +25,23 @@ def carried_out(
 
     Raises:
         Failed: as the skill does.
+        OSError, ValueError: as the tick does.
         TimeoutError: it takes longer; the caller sees to it that the hand stands.
     """
     reading_s = begin_s
     try:
         setpoint = next(skill)
         while reading_s < begin_s + most_s:
-            reading = tick(setpoint)
+            try:
+                reading = tick(setpoint)
+            except (OSError, ValueError) as error:
+                skill.throw(error)
+                raise
             reading_s = reading.time_s
             setpoint = skill.send(reading)
+        late = TimeoutError(f"run skill: not done in {most_s:g} s")
+        skill.throw(late)
+        raise late
     except StopIteration as done:
         found: T = done.value
         return found
-    raise TimeoutError(f"run skill: not done in {most_s:g} s")

@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Generator
+from contextlib import suppress
+from typing import TypeVar
 
 from sioms.hand.contacts import FINGER_M, Grasp, Likeness, classify, friction_angle_deviation, grasp
 from sioms.hand.feeling import Feeling
@@ -24,6 +26,8 @@ from sioms.hand.regrasp import NEUTRAL, disk_radii, regrasp_disk, regrasp_rectan
 from sioms.hand.rolling import correcting_law, friction_angle_rates, nearest_law
 from sioms.hand.shape import Touch, expected
 from sioms.hand.touch import Failed, Fault, Manner, Reading, Sensed, Setpoint, State
+
+T = TypeVar("T")
 
 
 class Skills(Feeling):
@@ -86,23 +90,38 @@ class Skills(Feeling):
         return self._guarded("hold", self._hold(_lasting(time_s)))
 
     def release(self) -> Generator[Setpoint, Reading, None]:
-        """Open by the clearance."""
-        yield from self._open()
-        self.state = State.IDLE
+        """Open by the clearance.
+
+        Raises:
+            Failed: a sensor that is not to be relied on; the hand is frozen.
+        """
+        return self._guarded("release", self._release())
 
     # the state machine
 
-    def _guarded(self, what: str, ticks: Generator[Setpoint, Reading, Sensed]) -> Generator[Setpoint, Reading, Sensed]:
+    def _guarded(self, what: str, ticks: Generator[Setpoint, Reading, T]) -> Generator[Setpoint, Reading, T]:
         self._what, self.state = f"{what} object", State.IDLE
         try:
             return (yield from ticks)
         except Failed as failed:
-            self.say(str(failed), failed.fault)
-            self.state, self._held = State.FAULT, False
-            if failed.fault.opens:
-                yield from self._let_go()
-            yield Setpoint(self.hand.forward(self.now.joints), STILL, 0.0, frozen=True)
+            self._ended(str(failed), failed.fault)
+            goal: Six = tuple(self._goal)  # type: ignore[assignment]
+            with suppress(Failed, OSError, ValueError):  # what ends meanwhile, the first fault is told
+                if failed.fault.opens:
+                    yield from self._let_go()
+                yield Setpoint(goal, STILL, 0.0, frozen=True)
             raise
+        except (OSError, ValueError) as error:  # of who carries it out
+            self._ended(f"{self._what}: {error}", Fault.HALTED)
+            raise
+
+    def _ended(self, text: str, fault: Fault) -> None:
+        self.say(text, fault)
+        self.state, self._held = State.FAULT, False
+
+    def _release(self) -> Generator[Setpoint, Reading, None]:
+        yield from self._open()
+        self.state = State.IDLE
 
     def _hold_parallel(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
         try:
@@ -276,7 +295,6 @@ class Skills(Feeling):
         self.say(f"roll from {_degrees(self._seen())}")
         filtered: tuple[float, float] | None = None
         while self.now.time_s - since < 0.15:
-            last_s = self.now.time_s
             seen = self._seen()
             filtered = _mixed(filtered, (seen.eta1, seen.eta2), 0.1)
             yield from self._tick(self._law(filtered))
@@ -288,8 +306,6 @@ class Skills(Feeling):
             if self.now.time_s > latest_s:
                 self.say(f"not parallel after {manner.roll_s:g} s of rolling: {_degrees(seen)}", Fault.NOT_PARALLEL)
                 break
-            if self.now.time_s - last_s <= 0.0:
-                raise Failed(Fault.STALE, "roll object: readings do not go on in time")
         return (yield from self._sense(manner.force_n))
 
     def _law(self, eta: tuple[float, float]) -> tuple[float, float]:

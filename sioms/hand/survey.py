@@ -139,8 +139,7 @@ class Survey(Skills):
         Raises:
             Failed: several grasps one after the other; the hand has opened or is frozen.
         """
-        found = yield from self._all(plan, told, first, self._one)
-        return found
+        return self._guarded("survey", self._all(plan, told, first, self._one))
 
     def slide(self, plan: Sequence[Setting], told: Told, first: int = 0) -> Generator[Setpoint, Reading, int]:
         """Close on a bar that is clamped to the platen, drag both fingers along it, and record how they slide.
@@ -148,13 +147,11 @@ class Survey(Skills):
         The links are across the line of centres, so that their stiff axes bear the friction. Directions and angles of
         the plan do not count, its forces do. Args, Returns and Raises as of ``carry_out``.
         """
-        found = yield from self._all(plan, told, first, self._dragged)
-        return found
+        return self._guarded("survey", self._all(plan, told, first, self._dragged))
 
     def _all(
         self, plan: Sequence[Setting], told: Told, first: int, one: Callable[..., Generator[Setpoint, Reading, Any]]
     ) -> Generator[Setpoint, Reading, int]:
-        self._what = "survey object"
         middle, failed = self._goal[:2], 0
         for setting in plan:
             try:
@@ -164,13 +161,11 @@ class Survey(Skills):
                 self._number += 1
                 self.progress(f"grasp {self._number} of {len(plan)}, {len(self.rows)} rows")
             except Failed as fault:
-                self.say(str(fault), fault.fault)
                 del self.rows[before:]  # half a grasp
                 failed += 1
                 if failed == TRIES:
-                    self.state, self._held = State.FAULT, False
-                    yield Setpoint(self.hand.forward(self.now.joints), STILL, 0.0, frozen=True)
                     raise
+                self.say(str(fault), fault.fault)
                 yield from self._recover()
         self.state = State.IDLE
         return self._number

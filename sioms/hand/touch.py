@@ -116,6 +116,7 @@ class Fault(Enum):
     OUT_OF_REACH = "out of reach"
     SINGULAR = "singular"
     NOT_PARALLEL = "not parallel"
+    HALTED = "hand halted"
 
     @property
     def opens(self) -> bool:

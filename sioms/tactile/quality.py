@@ -32,7 +32,7 @@ class Quality(Flag):
 
 _UNKNOWN = Quality.TOO_FEW_ELEMENTS | Quality.NO_BASELINE | Quality.BLIND
 _NOTHING = Quality.NO_CONTACT | Quality.WRONG_SIGN | _UNKNOWN
-_DOUBT = (
+DOUBT = (
     Quality.POOR_FIT | Quality.OUT_OF_ARC | Quality.OVERLOAD | Quality.NOT_CONVERGED | Quality.IMPRECISE
     | Quality.SUSPECT | Quality.WRONG_SIGN | Quality.SLOW
 )  # fmt: skip
@@ -53,7 +53,7 @@ def state_of(quality: Quality) -> State:
         return State.BLIND
     if quality & Quality.NO_CONTACT:
         return State.UNTOUCHED
-    return State.DOUBTFUL if quality & _DOUBT else State.TOUCHED
+    return State.DOUBTFUL if quality & DOUBT else State.TOUCHED
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +113,7 @@ class ShapeEstimate:
     @property
     def doubtful(self) -> bool:
         """Return whether a flag says not to rely on the numbers; an edge or a flat is no doubt."""
-        return bool(self.quality & (_NOTHING | _DOUBT))
+        return bool(self.quality & (_NOTHING | DOUBT))
 
 
 BLANK = ((math.nan,) * 3,) * 3

@@ -15,7 +15,7 @@ import errno
 import math
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from typing import Any, Self, TypeVar
 
@@ -28,7 +28,7 @@ from sioms.hand.follow import Follower, Order, standing
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.model import HandModel
 from sioms.hand.running import carried_out
-from sioms.hand.touch import Failed, Felt, Manner, Reading, Setpoint
+from sioms.hand.touch import Felt, Manner, Reading, Setpoint
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import AXIS_WRITE, WRITE
 
@@ -114,14 +114,15 @@ class CellHand:
         """Carry out a skill to its end; return what it found.
 
         Raises:
-            Failed: as the skill does; the hand stands.
+            Failed: as the skill does; the hand stands, whatever ends it.
             OSError: the hand was stopped, is in fault, or is not there any more.
             TimeoutError: it takes longer than `most_s`, in the hand's time.
         """
         try:
             found = carried_out(ticks, self.tick, self.reading.time_s, most_s)
-        except (Failed, TimeoutError):
-            self.stop()
+        except BaseException:
+            with suppress(OSError):  # a hand that is not there any more has been halted by its daemon
+                self.stop()
             raise
         self.keep()
         return found
