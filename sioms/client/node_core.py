@@ -12,7 +12,7 @@ from sioms.protocol import text
 from sioms.protocol.flags import NodeClass, PageState, Request, WriteFlag
 from sioms.protocol.messages import MAX_INLINE, MAX_WRITE
 from sioms.protocol.nodeinfo import NodeInfo
-from sioms.protocol.page import NotReadable, as_of_ns
+from sioms.protocol.page import AS_OF, NotReadable, as_of_ns
 from sioms.protocol.records import ANALOG_WRITE, BINARY_WRITE
 from sioms.protocol.verbs import Ioctl, Write
 
@@ -209,8 +209,9 @@ class NodeCore(Generic[S]):
         try:
             raw = self._latest(monotonic_ns())
             if self.owed_ns > self._shown_ns:
-                # As _is_paid does, in fewer steps: a loop that reads behind each write finds their code in no cache.
-                instant_ns = int.from_bytes(raw[24:32], "little")
+                # As _is_paid does, in fewer steps: a loop that reads behind each write finds their code in no cache,
+                # but that of structures, which it is about to ask for a column.
+                (instant_ns,) = AS_OF(raw)
                 if instant_ns >= self.owed_ns:
                     self._shown_ns = instant_ns
                 else:

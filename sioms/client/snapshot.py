@@ -61,22 +61,32 @@ class Layout:
         self.bit = bit
         self.count = len(channels)
         self.columns = READ[node_class]
-        contiguous = channels == list(range(channels[0], channels[0] + len(channels)))
-        self.rows: dict[str, tuple[Callable[..., tuple[Any, ...]], int, list[int] | None]] = {}
-        for row, (name, column) in enumerate(self.columns.items()):
-            start, code = SLOT_HEADER + 8 * block_channels * row, column.code
-            if contiguous:
-                self.rows[name] = (Struct(f"<{self.count}{code}").unpack_from, start + 8 * channels[0], None)
-            else:
-                self.rows[name] = (Struct(f"<{block_channels}{code}").unpack_from, start, channels)
+        self.rows: dict[str, Callable[[bytes], tuple[Any, ...]]] = {
+            name: self._row(row, column.code, name == _INSTANT)
+            for row, (name, column) in enumerate(self.columns.items())
+        }
+        """By column: what takes the values of the channels that the node shows out of a snapshot."""
+        if bit >= 0:
+            port = self.rows["data"]
+            self.rows["data"] = lambda raw: (port(raw)[0] >> bit & 1,)
 
-    def row(self, raw: bytes, name: str) -> tuple[Any, ...]:
-        """Return one column of all channels."""
-        unpack, offset, pick = self.rows[name]
-        values = unpack(raw, offset)
-        if name == _INSTANT and self.clock is not None:
-            values = tuple([value and self.clock.here(value) for value in values])
-        return values if pick is None else tuple([values[i] for i in pick])
+    def _row(self, row: int, code: str, instant: bool) -> Callable[[bytes], tuple[Any, ...]]:
+        first, count, channels, clock = self.channels[0], self.count, self.channels, self.clock
+        start = SLOT_HEADER + 8 * self.block_channels * row
+        unpack: Callable[[bytes], tuple[Any, ...]]
+        if channels == list(range(first, first + count)):
+            # One call of C, in the end: its reader is a control loop, and whatever else it touches is in no cache.
+            unpack = Struct(f"<{start + 8 * first}x{count}{code}").unpack_from
+        else:
+            whole = Struct(f"<{start}x{self.block_channels}{code}").unpack_from
+
+            def unpack(raw: bytes) -> tuple[Any, ...]:
+                values = whole(raw)
+                return tuple([values[i] for i in channels])
+
+        if clock is None or not instant:
+            return unpack
+        return lambda raw: tuple([value and clock.here(value) for value in unpack(raw)])
 
 
 class Snapshot:
@@ -151,7 +161,7 @@ class Snapshot:
         # Loaded when first used: named tuples are a tenth of the start time of a shell tool.
         from .reading import READING
 
-        return READING[self._layout.node_class](*[self._row(name)[index] for name in self._layout.columns])
+        return READING[self._layout.node_class](*[row(self._raw)[index] for row in self._layout.rows.values()])
 
     def __iter__(self) -> Iterator[Any]:
         return iter([self[i] for i in range(len(self))])
@@ -175,10 +185,7 @@ class Snapshot:
                 f"no field {field} in {self._layout.node_class.name.lower()} readings; "
                 f"there are: {', '.join(self._layout.columns)}"
             )
-        return np.array(self._row(field))
-
-    def _row(self, name: str) -> tuple[Any, ...]:
-        return self._layout.row(self._raw, name)
+        return np.array(self._layout.rows[field](self._raw))
 
     if TYPE_CHECKING:
 
@@ -188,13 +195,9 @@ class Snapshot:
 
 def _column(column: Column) -> property:
     name = column.name
-    if name == _INSTANT:
-        return property(lambda self: self._layout.row(self._raw, name), doc=f"Of each channel: {column.text} [ns].")
 
     def get(self: Snapshot) -> tuple[Any, ...]:
-        unpack, offset, pick = self._layout.rows[name]
-        values = unpack(self._raw, offset)
-        return values if pick is None else tuple([values[i] for i in pick])
+        return self._layout.rows[name](self._raw)
 
     unit = column.unit.format(u="unit of the channel", f="N or N*m")
     return property(get, doc=f"Of each channel: {column.text}{unit and f' [{unit}]'}.")
@@ -244,16 +247,6 @@ class BinarySnapshot(Snapshot):
 
     __slots__ = ()
 
-    @property
-    def data(self) -> tuple[int, ...]:
-        """Bits of each port; of a bit node 0 or 1."""
-        values = self._layout.row(self._raw, "data")
-        bit = self._layout.bit
-        return values if bit < 0 else (values[0] >> bit & 1,)
-
-    def _row(self, name: str) -> tuple[Any, ...]:
-        return self.data if name == "data" else self._layout.row(self._raw, name)
-
 
 SNAPSHOT: dict[NodeClass, type[Snapshot]] = {
     NodeClass.AXIS: AxisSnapshot,
@@ -262,5 +255,4 @@ SNAPSHOT: dict[NodeClass, type[Snapshot]] = {
 }
 for _class, _columns in READ.items():
     for _name in _columns:
-        if not hasattr(SNAPSHOT[_class], _name):
-            setattr(SNAPSHOT[_class], _name, _column(_columns[_name]))
+        setattr(SNAPSHOT[_class], _name, _column(_columns[_name]))

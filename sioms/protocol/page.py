@@ -51,7 +51,8 @@ HEADER_FIELDS = {
 """The header, field by field, in codes of struct."""
 _HEADER = Struct("<" + "".join([*HEADER_FIELDS.values()][:12]))
 _SLOT = Struct("<QQQQ")
-_AS_OF = Struct("<Q")
+AS_OF = Struct("<24xQ").unpack_from
+"""Takes the instant up to which a copied snapshot shows everything out of it, in a tuple of one."""
 
 _ORDERED = os.uname().machine in ("x86_64", "i686", "AMD64")
 """Whether stores become visible, and loads are made, in the order of the program."""
@@ -380,4 +381,5 @@ def slot_header(raw: bytes) -> tuple[int, int, int]:
 
 def as_of_ns(raw: bytes) -> int:
     """Return the instant up to which a copied snapshot shows everything [ns, CLOCK_MONOTONIC]."""
-    return int.from_bytes(raw[24:32], "little")
+    (instant_ns,) = AS_OF(raw)
+    return int(instant_ns)
