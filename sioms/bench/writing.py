@@ -4,52 +4,63 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Sequence
+from statistics import mean
 from typing import Any
 
-from sioms.check.daemon import CpuTimes, Daemon
+from sioms.check.daemon import CpuTimes, Daemon, on_processors
 from sioms.client.command import command
 
 from .baseline import RoundTrip
 from .figures import Bar, Report
 from .options import Options
+from .paced import two_places
 from .workcells import axes, workcell
 
 CHUNK = 100
 MANY = 10_000
+KERNEL = "where the kernel puts them"
+"""Each pair of processes finds a place of its own then, so that a ratio compares places, too, and has no bar."""
 
 
 def bench_write(options: Options, report: Report) -> None:
-    """One record, 16 records, and 10,000 commands appended, interleaved with bare round trips."""
-    count = options.count(1_000, 20_000)
+    """One record and 16 in a row, in turn with bare round trips of processes at the same place; 10,000 appended."""
     config = workcell([axes("mod0"), axes("mod1", 16)])
     with Daemon(config) as daemon, daemon.cell() as cell, RoundTrip() as bare:
-        pids = daemon.device_pids()
+        drivers = [daemon.device_pids()[name] for name in ("mod0", "mod1")]
         with cell.open("mod0", "rw") as mod0, cell.open("mod1", "rw") as mod1:
-            one = [command(0, position=p) for p in (0.001, -0.001)]
-            velocity = [command(0, velocity=v) for v in (0.001, -0.001)]
-            sixteen = [b"".join([command(i, position=p) for i in range(16)]) for p in (0.001, -0.001)]
-            trips: list[int] = []
-            taken: dict[str, list[int]] = {
-                "1 position, replacing": [],
-                "1 velocity, replacing": [],
-                "16, replacing": [],
-            }
-            cpu = CpuTimes({"client": os.getpid(), "driver": pids["mod0"]})
-            while len(trips) < count:
-                trips += bare.samples(CHUNK, len(one[0]))
-                taken["1 position, replacing"] += _writes(mod0, one, CHUNK)
-                taken["1 velocity, replacing"] += _writes(mod0, velocity, CHUNK)
-                taken["16, replacing"] += _writes(mod1, sixteen, CHUNK)
-                report.progress(f"write: {len(trips)} of {count}")
-            shares = cpu.shares()
-            base = report.samples("bare round trip", trips)
-            for name, samples in taken.items():
-                bars = [Bar("ratio", 3.0), Bar("p50", 145)] if name.startswith("1 ") else []
-                report.samples(f"write to acknowledgement, {name}", samples, baseline=base, bars=bars)
-            report.value("processor share of the driver while written to", shares["driver"], "", cpu=shares)
+            for where, (ours, theirs) in two_places(report).items():
+                with on_processors({os.getpid(): ours, **dict.fromkeys([*drivers, bare.pid], theirs)}):
+                    _in_a_row(options, report, (mod0, mod1), bare, where, drivers[0])
+            _in_a_row(options, report, (mod0, mod1), bare, KERNEL, drivers[0])
             mod0.stop()
             mod0.wait_until_idle(5.0)
             _append_many(mod0, options, report)
+
+
+def _in_a_row(options: Options, report: Report, nodes: Sequence[Any], bare: RoundTrip, where: str, driver: int) -> None:
+    mod0, mod1 = nodes
+    one = [command(0, position=p) for p in (0.001, -0.001)]
+    velocity = [command(0, velocity=v) for v in (0.001, -0.001)]
+    sixteen = [b"".join([command(i, position=p) for i in range(16)]) for p in (0.001, -0.001)]
+    count, trips = options.count(1_000, 20_000), list[int]()
+    taken: dict[str, list[int]] = {"1 position": [], "1 velocity": [], "16": []}
+    cpu = CpuTimes({"client": os.getpid(), "driver": driver})
+    while len(trips) < count:
+        trips += bare.samples(CHUNK, len(one[0]))
+        taken["1 position"] += _writes(mod0, one, CHUNK)
+        taken["1 velocity"] += _writes(mod0, velocity, CHUNK)
+        taken["16"] += _writes(mod1, sixteen, CHUNK)
+        report.progress(f"write, {where}: {len(trips)} of {count}")
+    shares = cpu.shares()
+    base = report.samples(f"bare round trip, {where}", trips)
+    for name, samples in taken.items():
+        report.samples(
+            f"write to acknowledgement, {name}, replacing, {where}", samples, baseline=base,
+            bars=[Bar("p50", 145), *[Bar("ratio", 3.0)] * (where != KERNEL)] if name.startswith("1 ") else [],
+            notes=f"{1e9 / mean(samples):.0f} a second, mean {mean(samples) / mean(trips):.1f} mean bare round trips",
+        )  # fmt: skip
+    report.value(f"processor share of the driver while written to, {where}", shares["driver"], "", cpu=shares)
 
 
 def _writes(node: Any, records: list[bytes], count: int) -> list[int]:
