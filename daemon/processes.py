@@ -104,7 +104,7 @@ class Processes:
                 self._cell.shared.journal.note(Note.MARKER, stamp_ns, device.name, number)
                 self._markers.signalled()
             case driver_verbs.Stopped(source):
-                self._stops.stopped(device, source)
+                self._stops.stop_workcell(source)
             case driver_verbs.LinkChanged(number, reason):
                 state = PageState(number)
                 good = state in (PageState.GOOD, PageState.STARTING)

@@ -63,6 +63,7 @@ class StopRecord:
         size = os.fstat(self._fd).st_size
         start = max(_first_byte(self._fd, size), size - LARGEST)
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
+        self.state.requested = 0  # of a file that is there no more
         self.by_drivers: list[Mapping[str, Any]] = []
         self.asked = PartTimes()
         self._at = size

@@ -126,6 +126,7 @@ class StopVerbs:
             device.reset(sent_ns)
             self._cell.log("info", "reset", node=node.name, device=device.name, by=session)
             return
+        self._stops.hear_request()
         latch = self._cell.shared.latch
         if latch.stopped_ns:
             raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")

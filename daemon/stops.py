@@ -66,7 +66,7 @@ class Stops:
         self._wake_drivers()
         self._shared.record.look()
         if not known or not self._shared.record.state.workcell:
-            self._note(workcell_entry(source, stop=True, named=True, latched_ns=latch.stopped_ns))
+            self._note(workcell_entry(source, stop=True, named=True, resets=latch.resets))
 
     def hear_request(self) -> str:
         """Obey the stop-request file; return who has asked for a stop that nobody had heard yet, '' for nobody.
@@ -114,12 +114,14 @@ class Stops:
             sent_ns: when that was sent, at the earliest [ns, CLOCK_MONOTONIC].
             by: number of the session.
         """
-        latched_ns = self._shared.latch.stopped_ns
-        self._note(workcell_entry(who, stop=False, latched_ns=latched_ns))  # first: a later stop is noted after it
-        # What has been asked for since the mark has not been heard.
+        latch, answered = self._shared.latch, self._request_seen
+        word = answered[0] if answered[0] <= time.monotonic_ns() else 0  # anybody can write any
+        entry = workcell_entry(who, stop=False, resets=latch.resets + 1, request=word)
+        self._note(entry)  # first: a later stop is noted after it
         sent_ns = max(sent_ns, self._shared.record.asked.own_of_any_ns(by))
-        self._shared.latch.reset(time.monotonic_ns(), self._request_seen, sent_ns)
+        latch.reset(time.monotonic_ns(), answered, sent_ns)
         self._cell.log("warning", "reset", by=who)
+        self.hear_request()  # what has been asked for since
         for device in self._cell.devices.values():
             device.tell(driver_verbs.StopChanged())
             device.reset(sent_ns)
@@ -155,12 +157,9 @@ class Stops:
         """
         record = self._shared.record
         record.look()
-        if node is not None:
-            return record.asked.latest_ns(*_masks(*self._parts(node)), by) > instant_ns
-        latched_ns = self._shared.latch.stopped_ns
-        if latched_ns > max(instant_ns, record.asked.own_of_any_ns(by)):
-            return True  # by a driver
-        return record.asked.latest_of_any_ns(by) > instant_ns
+        asked = record.asked
+        latest_ns = asked.latest_of_any_ns(by) if node is None else asked.latest_ns(*_masks(*self._parts(node)), by)
+        return latest_ns > instant_ns
 
     def reset_node(self, node: Node, who: str, sent_ns: int, by: int) -> None:
         """Clear the stop and the faults of a node.
@@ -240,16 +239,11 @@ class Stops:
                 self._shared.latch.ordered()
             self._cell.log("warning", "emergency stop", node=entry[NODE], source=entry["by"], heard_by=entry[PID])
 
-    def stopped(self, device: DriverProcess, source: str) -> None:
-        """Wake the other drivers: one has latched the stop of the workcell."""
-        self._cell.log("warning", "emergency stop", source=source, device=device.name)
-        self._wake_drivers(but=device)
-
-    def _wake_drivers(self, but: DriverProcess | None = None) -> None:
+    def _wake_drivers(self) -> None:
         """Have processes look at the latch before their next tick, which looks anyway; of several devices in one, one
         looks for all: one that ticks, where there is one, as others may not have begun to listen.
         """
-        told = set() if but is None else {but.lives_in}
+        told = set()
         for device in sorted(self._cell.devices.values(), key=lambda device: device.contact is None):
             if device.is_there and device.lives_in not in told:
                 told.add(device.lives_in)

@@ -209,6 +209,7 @@ class Process:
         import mmap
 
         self.latch = Latch(memoryview(mmap.mmap(latch, LATCH_SIZE)))
+        self.latch.begin(0, (0, os.fstat(self.request).st_mtime_ns))
         self.latch.daemon_alive(CLOCK.now_ns)
         self.devices = [
             Device(self.group, latch, self.request, rate, phase, driver, table(rate))
@@ -320,7 +321,7 @@ def processes() -> Iterator[Callable[..., Process]]:
         patch.setattr(steps, "set_timer", set_timer)
         patch.setattr(steps.Quiet, "address", property(id))
         patch.setattr(sioms.sdk.quiet, "Quiet", steps.Quiet)
-        for name in ("begin_halt", "begin_stop", "wait_turn"):
+        for name in ("begin_asked_stop", "begin_halt", "wait_turn"):
             patch.setattr(sioms.sdk.group, name, getattr(steps, name))
         patch.setattr(sioms.sdk.quiet, "library", object())
         patch.setattr(sioms.sdk.group, "time", SimpleNamespace(sleep=lambda _: None, monotonic_ns=CLOCK))

@@ -128,10 +128,11 @@ class World:
             "resets": 0,
         }  # fmt: skip
         fds = [theirs.detach(), latch, request, taken, markers, journal, events]
-        self.runtime = Runtime(driver, "dev", settings, 1, options, fds)
         import mmap
 
         self.latch = Latch(memoryview(mmap.mmap(latch, LATCH_SIZE)))
+        self.latch.begin(0, (0, os.fstat(request).st_mtime_ns))
+        self.runtime = Runtime(driver, "dev", settings, 1, options, fds)
         self.markers = MarkerTable(memoryview(mmap.mmap(markers, TABLE_SIZE)))
         self.latch.daemon_alive(time.monotonic_ns())
         self._fds, self.journal = [latch, markers, journal, events], journal

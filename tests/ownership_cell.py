@@ -436,7 +436,8 @@ class Cell:
             return model._replace(clients=((OUT, ""),) * CLIENTS, waiting=(), devices=devices)
         self.record.look()  # type: ignore[union-attr]
         state, latch = server.cell.shared.record.state, server.cell.shared.latch
-        assert bool(latch.stopped_ns) == bool(state.workcell), "latch and journal agree"
+        stopped = bool(latch.stopped_ns) or self._view_request() == 2
+        assert stopped == bool(state.workcell), "latch, requests and journal agree"
         stopped_nodes = {name for name, *_ in state.nodes()}
         devices = tuple(self._view_device(d, model) for d in range(DEVICES))
         sessions = {s.peer.pid: s for s in server.clients.sessions}
@@ -459,7 +460,7 @@ class Cell:
         assert len(server.requests.nodes._claims) == len(handles), "nothing is owned without a handle"
         return State(
             True,
-            bool(latch.stopped_ns),
+            stopped,
             tuple(name in stopped_nodes for name in NAMES),
             self._view_request(),
             self.guest,

@@ -177,7 +177,7 @@ class Step:
 
     def _listen_first(self, d: int) -> None:
         """Who judges a reset hears first what drivers have told: of faults, which are not in the model."""
-        if self._driver(d) is not None:
+        if self._driver(d) is not None and self.devices[d].phase != ENDING:
             self.listen(d)
 
     def reset_node(self, c: int, d: int) -> None:
@@ -188,6 +188,8 @@ class Step:
             self.answer = "done"  # another try, for the device; what is stopped stays so
             self.start(d)
             return
+        if self._may_write(c):
+            self._hear_request()
         if not self._may_write(c) or self.stopped or (there and not self._send(d, RESET)):
             self.answer = "refused"
             return
@@ -386,8 +388,9 @@ class Step:
 
     def start(self, d: int) -> None:
         self._set(
-            d, phase=STARTING, driver=(Driver(outbox=(READY,), node_stop=self.node_stops[d], stopped=self.stopped),)
+            d, phase=STARTING, driver=(Driver(outbox=(READY,), node_stop=self.node_stops[d], asked=self.request > 0),)
         )
+        self._heed(d)
 
     def beat(self) -> None:
         self._hear_request()

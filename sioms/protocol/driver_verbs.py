@@ -161,7 +161,7 @@ class MarkerSignalled(Message, on=FROM_DRIVER, verb=DriverVerb.MARKER_SIGNALLED,
 
 
 class Stopped(Message, on=FROM_DRIVER, verb=DriverVerb.STOPPED, notice=True):
-    """The driver has latched the emergency stop of the workcell."""
+    """The driver stops the workcell, and could not write the stop-request file."""
 
     source: Text
 

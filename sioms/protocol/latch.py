@@ -1,8 +1,11 @@
 """The emergency-stop latch: a page of shared memory that every driver looks at in every tick.
 
-It is written by the daemon and the drivers alone: ``stopped_ns`` is 0, or the time when the workcell was stopped; the
-daemon also stamps ``daemon_alive_ns`` in it, from its real loop. Clients ask for a stop through the daemon or through
-the stop-request file (``stopfile``); they can thus cause a stop but never clear one.
+It is written by the daemon alone: ``stopped_ns`` is 0, or the time when the workcell was stopped; the daemon also
+stamps ``daemon_alive_ns`` in it, from its real loop. Clients ask for a stop through the daemon or through the
+stop-request file (``stopfile``), drivers through that file; they can thus cause a stop but never clear one.
+
+The workcell is stopped while the latch is, or while the file says something else than ``answered_request``. Who was
+stopped stays so until ``resets`` changes: that is the last word of a reset that is written.
 
 This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-rated function.
 """
@@ -11,7 +14,7 @@ from .text import printable
 
 LATCH_SIZE = 4096
 _STOPPED, _RESETS, _ALIVE, _ANSWERED, _ANSWERED_AT, _ORDERS, _RESET_AT, _ENDED = range(8)
-_TEXT, _NAMED, _TEXT_SIZE = 64, 320, 256
+_TEXT, _TEXT_SIZE = 64, 256
 _SEPARATE = 576
 _ENDED_AT, _RESET_SENT = 0, 1
 """Words that no steps look at: when the last stop was ended; when the last reset was sent."""
@@ -21,9 +24,9 @@ class Latch:
     """View of the latch page.
 
     Args:
-        buffer: the latch page, LATCH_SIZE bytes; writable in the daemon and the drivers.
+        buffer: the latch page, LATCH_SIZE bytes; writable in the daemon.
 
-    Concurrency: stores are single words; daemon and drivers may latch at the same time.
+    Concurrency: one process writes; stores are single words, and come in the order in which they are made.
     """
 
     def __init__(self, buffer: memoryview) -> None:
@@ -38,17 +41,19 @@ class Latch:
 
     @property
     def resets(self) -> int:
-        """How often the latch has been cleared; a stop between two looks shows as a change."""
+        """How often the latch has been cleared; a stop between two looks shows as a change. All that a reset says is
+        there before it changes.
+        """
         return self._words[_RESETS]
 
     @property
     def reset_ns(self) -> int:
-        """When the latch was cleared last [ns, CLOCK_MONOTONIC]; 0: never. It is there before ``resets`` changes."""
+        """When the latch was cleared last [ns, CLOCK_MONOTONIC]; 0: never."""
         return self._words[_RESET_AT]
 
     @property
     def ended_stop_ns(self) -> int:
-        """Which stop was the last that a reset has ended, as ``stopped_ns``; 0: none. As ``reset_ns``."""
+        """Which stop was the last that a reset has ended, as ``stopped_ns``; 0: none."""
         return self._words[_ENDED]
 
     @property
@@ -77,32 +82,43 @@ class Latch:
 
     @property
     def source(self) -> str:
-        """Who stopped and why; what the daemon knows of it goes before what a driver saw."""
-        return self._text(_NAMED) or self._text(_TEXT)
+        """Who stopped and why."""
+        text = bytes(self._bytes[_TEXT : _TEXT + _TEXT_SIZE]).split(b"\0")[0]
+        return printable(text.decode("utf-8", "replace"))
 
     def stop(self, now_ns: int, source: str) -> bool:
         """Latch the stop; return whether it was not latched before."""
         if self._words[_STOPPED]:
             return False
-        self._set_text(_TEXT, source)
+        self.name_source(source)
         self._words[_STOPPED] = now_ns
         return True
 
     def name_source(self, source: str) -> None:
-        """Say better who stopped (the daemon's alone: a driver that latches at the same time cannot undo it)."""
-        self._set_text(_NAMED, source)
+        """Say better who stopped."""
+        text = printable(source).encode()[: _TEXT_SIZE - 1]
+        self._bytes[_TEXT : _TEXT + _TEXT_SIZE] = text.ljust(_TEXT_SIZE, b"\0")
 
     @property
     def answered_request(self) -> tuple[int, int]:
-        """Mark of the stop-request file that the last reset answered: no new request to who sees it only now."""
+        """Mark of the stop-request file that the last reset answered: any other is a stop that no reset has ended.
+        Until ``resets`` changes it may be half of what is being written.
+        """
         return self._words[_ANSWERED], self._words[_ANSWERED_AT]
 
-    def reset(self, now_ns: int, request: tuple[int, int] = (0, 0), sent_ns: int | None = None) -> None:
-        """Clear the latch (the daemon's, on behalf of somebody entitled).
+    def begin(self, resets: int, request: tuple[int, int]) -> None:
+        """Begin with the number of resets there have been, and the mark of a stop-request file to which nobody has
+        written yet.
+        """
+        self._words[_RESETS] = resets
+        self._words[_ANSWERED], self._words[_ANSWERED_AT] = request
+
+    def reset(self, now_ns: int, request: tuple[int, int] | None = None, sent_ns: int | None = None) -> None:
+        """Clear the latch, on behalf of somebody entitled.
 
         Args:
             now_ns: time of the reset: what clients have sent before it is not taken after it [ns, CLOCK_MONOTONIC].
-            request: mark of the stop-request file that is thereby answered.
+            request: mark of the stop-request file that is thereby answered; None: no other than before.
             sent_ns: when it was sent, at the earliest [ns, CLOCK_MONOTONIC]; None: now.
         """
         self._words[_RESET_AT] = now_ns
@@ -110,20 +126,15 @@ class Latch:
         if self._words[_STOPPED]:
             self._separate[_ENDED_AT] = now_ns
             self._words[_ENDED] = self._words[_STOPPED]
-        self._words[_ANSWERED], self._words[_ANSWERED_AT] = request  # before the latch opens
-        self._words[_RESETS] += 1
+        if request is not None:
+            self._words[_ANSWERED_AT] = request[1]
+            self._words[_ANSWERED] = request[0]  # last: half of it is older than the request
         self._words[_STOPPED] = 0
-        self._set_text(_NAMED, "")
+        self._words[_RESETS] += 1
 
     def daemon_alive(self, now_ns: int) -> None:
         """Stamp the daemon's loop as alive."""
         self._words[_ALIVE] = now_ns
-
-    def _text(self, at: int) -> str:
-        return printable(bytes(self._bytes[at : at + _TEXT_SIZE]).split(b"\0")[0].decode("utf-8", "replace"))
-
-    def _set_text(self, at: int, text: str) -> None:
-        self._bytes[at : at + _TEXT_SIZE] = printable(text).encode()[: _TEXT_SIZE - 1].ljust(_TEXT_SIZE, b"\0")
 
     def release(self) -> None:
         """Drop the views, so that the mapping can be closed."""

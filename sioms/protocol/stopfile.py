@@ -2,8 +2,9 @@
 
 Two files beside the daemon's socket:
 
-* ``SOCKET.stop`` may be written by everybody who may stop, and by nobody else (its owner, group, mode and access list
-  say who). Every write to it is a request to stop the workcell; nothing that is written there clears anything.
+* ``SOCKET.stop`` may be written by everybody who may stop, and by drivers, and by nobody else (its owner, group, mode
+  and access list say who). Every write to it is a request to stop the workcell, until a reset answers it; nothing that
+  is written there clears anything.
 * ``SOCKET.stopped`` is written by drivers and daemon: which request they have taken.
 
 Drivers look at the first in every tick. Its word and the time of its last change count together: who writes the old
@@ -71,6 +72,8 @@ class StopRequest:
             word, pid, why = _REQUEST.unpack(data)
             if word != self._word_before:
                 text = printable(why.split(b"\0")[0].decode("utf-8", "replace"))
+                if not pid and text:
+                    return text  # a driver's
                 return f"pid {pid}{': ' + text if text else ''}, through the stop-request page"
             os.sched_yield()
         return SOMEBODY
@@ -81,7 +84,7 @@ class StopRequest:
         return int.from_bytes(os.pread(self._fd, 8, 8), "little")
 
     def request(self, now_ns: int, pid: int, why: str = "") -> int:
-        """Request a stop of the workcell; return the word that stands for it."""
+        """Request a stop of the workcell; return the word that stands for it. Of pid 0 ``why`` says all there is."""
         os.pwrite(self._fd, _REQUEST.pack(now_ns, pid, why.encode()[:239]), 0)
         return now_ns
 

@@ -28,9 +28,8 @@ if TYPE_CHECKING:
     Part: TypeAlias = tuple[str, str, int, int]
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
-NODE, WORKCELL, CHECKPOINT, PID, LATCHED, ASKED = "node", "workcell", "checkpoint", "pid", "latched", "asked"
-MOST_ENDED = 16
-"""Stops of the workcell that are known to have been reset: a driver that notes one of them later does not stop anew."""
+NODE, WORKCELL, CHECKPOINT, PID, ASKED = "node", "workcell", "checkpoint", "pid", "asked"
+RESETS, REQUEST = "resets", "request"
 MOST_PARTS = 1 << 20
 """Channels, and bits of channels, that an entry may name, and that may be stopped in all."""
 LAST_S = 1e11
@@ -66,17 +65,20 @@ def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:
     return [(channel, bit)] if bit >= 0 else [(channel, b) for b in range(width or 1)]
 
 
-def workcell_entry(source: str, *, stop: bool, named: bool = False, latched_ns: int = 0) -> dict[str, Any]:
+def workcell_entry(
+    source: str, *, stop: bool, named: bool = False, resets: int = 0, request: int = 0
+) -> dict[str, Any]:  # fmt: skip
     """Return the entry of the stop or the reset of the workcell.
 
     Args:
         source: who did it, and why.
         stop: whether it is a stop.
         named: it says better who has stopped it.
-        latched_ns: when the stop was latched, by which it is known [ns, CLOCK_MONOTONIC]; of a reset, the stop that it
-            ends. 0: unknown.
+        resets: how many resets there had been before a stop; of a reset, with itself.
+        request: word of the stop-request file that the stop obeys; 0: it is none of the file, or counts in any case. Of
+            a reset, the last one that it answers.
     """
-    known = {LATCHED: latched_ns} if latched_ns else {}
+    known = {key: value for key, value in ((RESETS, resets), (REQUEST, request)) if value}
     return {WORKCELL: "", "stop": stop, "by": source, **({"named": True} if named else {}), **known}
 
 
@@ -114,13 +116,17 @@ class Stopped:
         workcell: who has stopped the workcell, '' when it is not stopped.
         since_s: when that was [s since 1970].
         parts: of nodes that are stopped: who did it, and the name of the node.
-        ended: when the last stops of the workcell that were reset had been latched [ns, CLOCK_MONOTONIC].
+        resets: how many resets of the workcell there have been.
+        request: the last word of the stop-request file that they have answered.
+        requested: of a stop that drivers have read from that file, and the daemon has not noted since, its word.
     """
 
     workcell: str = ""
     since_s: float = 0.0
     parts: dict[Part, tuple[str, str]] = field(default_factory=dict)
-    ended: tuple[int, ...] = ()
+    resets: int = 0
+    request: int = 0
+    requested: int = 0
 
     def apply(self, entry: Mapping[str, Any]) -> None:
         """Take an entry into account.
@@ -130,15 +136,18 @@ class Stopped:
         """
         stop, by = bool(entry["stop"]), printable(str(entry["by"]), 400)
         if WORKCELL in entry:
-            latched_ns = int(entry.get(LATCHED, 0))
+            resets, request = int(entry.get(RESETS, 0)), int(entry.get(REQUEST, 0))
             if not stop:
-                self.workcell, self.since_s = "", 0.0
+                if self.requested <= request:
+                    self.workcell, self.since_s, self.requested = "", 0.0, 0
                 self.parts.clear()
-                if latched_ns:
-                    self.ended = (*self.ended, latched_ns)[-MOST_ENDED:]
-            elif latched_ns in self.ended:
+                self.resets, self.request = max(self.resets, resets), request
+                return
+            if resets < self.resets and 0 < request <= self.request:
                 return  # it was noted behind its own reset
-            elif not self.workcell or entry.get("named"):
+            named = bool(entry.get("named"))
+            self.requested = 0 if named else max(self.requested, request)
+            if not self.workcell or named:
                 if not 0 <= (at := float(entry["at"])) < LAST_S:
                     raise ValueError(f"at {at} s")
                 self.workcell, self.since_s = by or "somebody", self.since_s or at
@@ -190,9 +199,10 @@ class Stopped:
 
     def entries(self) -> list[dict[str, Any]]:
         """Return entries that lead from nothing to this state."""
-        entries = [workcell_entry("", stop=False, latched_ns=latched_ns) for latched_ns in self.ended]
+        entries = [workcell_entry("", stop=False, resets=self.resets, request=self.request)] if self.resets else []
         if self.workcell:
-            entries.append({**workcell_entry(self.workcell, stop=True), "at": self.since_s})
+            entry = workcell_entry(self.workcell, stop=True, resets=self.resets, request=self.requested)
+            entries.append({**entry, "at": self.since_s})
         for device in dict.fromkeys(part[0] for part in self.parts):
             for block, runs, by, name in self.of_device(device):
                 entries.append(node_entry(name, device, block, _unpacked(runs), by, stop=True))

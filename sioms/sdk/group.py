@@ -29,7 +29,7 @@ from sioms.protocol.verbs import take
 
 from .finding import find_driver, read_settings
 from .quiet import QuietRun
-from .quiet_step import Many, begin_halt, begin_stop, heed_one, run_many, wait_turn
+from .quiet_step import Many, begin_asked_stop, begin_halt, heed_one, run_many, wait_turn
 from .rt import ChangeWatch, name_process, settle
 from .runtime import Runtime
 
@@ -295,19 +295,19 @@ class Group:
             member.runtime.running = False
 
     def _heed_requests(self) -> None:
-        """Somebody asks for a stop: put it into the latch, for all."""
+        """Somebody has written to the stop-request file."""
         if self._requests is not None:
             self._requests.drain()
-        for member in list(self._members.values())[:1]:
-            self._guarded(member, member.runtime.stops.latch_request)
         self._begin_stops()
 
     def _begin_stops(self) -> None:
         """Have all brake at once, by steps where these can; they tell of it one by one, behind a tick that shows it."""
         now_ns, self._is_braking = time.monotonic_ns(), True
         for fd, member in self._members.items():
+            if member.quiet is not None and member.quiet.record.is_stopped:
+                continue  # by the same request, whose stop the daemon has latched now
             member.owes = True
-            self._rank(fd, CAN_WAIT if self._is_stopped(member, now_ns) else STOPS)
+            self._rank(fd, CAN_WAIT if self._brakes(member, now_ns) else STOPS)
 
     def _look_for_stops(self) -> bool:
         """Begin a stop that has been latched since the last look, of which the daemon tells one device of a process;
@@ -321,10 +321,9 @@ class Group:
         begun, self._is_braking = self._is_braking, False
         return begun
 
-    def _is_stopped(self, member: Member, now_ns: int) -> bool:
-        """Have a member begin its stop by steps; return whether it has, or has been stopped before."""
-        quiet = member.quiet
-        return quiet is not None and (quiet.record.stopped != 0 or begin_stop(quiet.record, now_ns) == 0)
+    def _brakes(self, member: Member, now_ns: int) -> bool:
+        """Have a member begin its stop by steps; return whether it has."""
+        return member.quiet is not None and begin_asked_stop(member.quiet.record, now_ns) != 0
 
 
 def _close(fds: list[int]) -> None:

@@ -60,9 +60,10 @@ class QuietRun:
         self._clients, self._statistics = clients, statistics
         self._ready = np.zeros(MOST_EVENTS, dtype=np.int64)
         self.record = Quiet(
-            poll=poll, timer=timer, line_timer=line_timer, ready=self._ready, latch=latch, stopped=0, resets=0,
-            orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1, lead_ns=lead_ns,
-            announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0, device=steps.record,
+            poll=poll, timer=timer, line_timer=line_timer, ready=self._ready, latch=latch, is_stopped=0, stopped=0,
+            resets=0, orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1,
+            lead_ns=lead_ns, announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0,
+            device=steps.record,
             tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, desk=desk.record,
             request=desk.request, early_ns=0, heeded_ns=0, brakes=0, braked_ns=0, patient=0, control=control,
             called=0, spare=np.zeros(MOST_EVENTS, dtype=np.int64), instants=instants, scheduled_ns=0, ticked_ns=0,
@@ -92,6 +93,7 @@ class QuietRun:
         self.desk.lend()
         record.until_ns = min(until_ns, self._clients.until_ns())
         record.stopped, record.resets, record.orders = self._stops.seen
+        record.is_stopped = self._stops.stopped
         record.scheduled_ns, record.number = scheduled_ns, number
         record.watched, record.periods, record.restless_ns = watched, idling.periods, idling.restless_ns
         record.announced, record.worked_ns = announced, worked_ns

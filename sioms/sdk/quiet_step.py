@@ -87,8 +87,9 @@ class Page(Record):
 class Quiet(Record):
     """A driver process between two events.
 
-    ``poll``, ``timer``, ``line_timer`` and ``ready``: descriptors. ``latch`` page, and what of it has been seen. After
-    ``until_ns`` a lease or a wait may end. ``device`` has the steps ``tick``, ``slack``, ``rest`` and ``stop``.
+    ``poll``, ``timer``, ``line_timer`` and ``ready``: descriptors. ``latch`` page, and what of it has been seen;
+    ``is_stopped``, whether the workcell is known to be stopped, maybe before the latch is. After ``until_ns``
+    a lease or a wait may end. ``device`` has the steps ``tick``, ``slack``, ``rest`` and ``stop``.
 
     A tick comes every ``period_ns`` times ``periods``. ``lead_ns`` before it, where that is not 0 and periods are 1, is
     its slack: ``announced`` until the tick, after ``worked_ns`` of work. ``watched``: somebody looks at the device;
@@ -115,6 +116,7 @@ class Quiet(Record):
     line_timer: int
     ready: Integers
     latch: Integers
+    is_stopped: int
     stopped: int
     resets: int
     orders: int
@@ -223,7 +225,7 @@ def begin_stop(q: Quiet, now_ns: int) -> int:
     """
     if not q.latch[STOPPED] or q.latch[STOPPED] == q.stopped or q.latch[RESETS] != q.resets:
         return 1
-    if q.brakes != STOPS and begin_to_brake(q, now_ns, 1, q.latch[STOPPED]):
+    if not q.is_stopped and q.brakes != STOPS and begin_to_brake(q, now_ns, 1, q.latch[STOPPED]):
         return 1
     q.stopped = q.latch[STOPPED]
     return 0
@@ -231,13 +233,13 @@ def begin_stop(q: Quiet, now_ns: int) -> int:
 
 @step
 def begin_asked_stop(q: Quiet, now_ns: int) -> int:
-    """Begin to stop where somebody asks for it, who may not have come to the latch yet; return whether all axes brake
-    for a stop. What a reset has answered is no stop any more.
+    """Begin to stop where somebody asks for it, of whom the daemon may not have heard yet; return whether all axes
+    brake for a stop. What a reset has answered is no stop any more.
     """
     f = q.request
     if q.latch[STOPPED]:
         begin_stop(q, now_ns)
-    elif not (q.brakes == STOPS or q.stopped or q.latch[RESETS] != q.resets) and is_requested(f):
+    elif not (q.brakes == STOPS or q.is_stopped or q.latch[RESETS] != q.resets) and is_requested(f):
         word = first_word_of(f.file)
         answered = word == q.latch[ANSWERED] and changed_ns(f.file) == q.latch[ANSWERED_AT]
         if word >= 0 and not answered:
@@ -329,7 +331,7 @@ def may_tick(q: Quiet, now_ns: int) -> int:
     if q.desk.kept and not may_wait(q, now_ns):
         return 0
     if q.latch[RESETS] != q.resets:
-        if not q.patient or not q.stopped:
+        if not q.patient or not q.is_stopped:
             return 0
         owe(q)
     elif q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns):

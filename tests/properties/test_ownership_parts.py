@@ -27,7 +27,7 @@ def wholes() -> dict[str, Whole]:
 def test_no_promise_is_broken_in_any_state_of_the_parts(wholes: dict[str, Whole]) -> None:
     assert {name: (len(whole), sum(map(len, whole.values()))) for name, whole in wholes.items()} == {
         "owners": (28_320, 257_953),
-        "stops": (1_811, 11_844),
+        "stops": (1_956, 13_170),
     }, "as decision 0910 says"
 
 

@@ -121,8 +121,16 @@ def test_one_device_of_each_process_is_told_of_a_stop_and_one_that_listens(rig: 
     rig.stops.stop_workcell("eva")
     assert [device.name for device in devices if device.told] == ["ticks", "alone", "many", "begins"]
     assert max(device.told for device in devices) == 1
-    rig.stops.stopped(devices[2], "an input")  # type: ignore[arg-type]
-    assert [device.told for device in devices] == [0, 1, 0, 2, 2, 2, 0], "its own process has seen it"
+
+
+def test_what_a_driver_has_written_to_the_file_is_taken_up_once(rig: Rig) -> None:
+    rig.request.request(2000, 0, "an input")
+    for _ in range(2):
+        rig.stops.hear_request()
+        assert rig.latch.source == "an input" and rig.noted == ["an input"]
+    rig.latch.reset(3000, rig.request.mark)
+    rig.stops.hear_request()
+    assert not rig.latch.stopped_ns
 
 
 class Told:

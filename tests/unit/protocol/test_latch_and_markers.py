@@ -32,18 +32,6 @@ def test_the_latch_holds_its_first_stop_until_reset() -> None:
     assert other.daemon_alive_ns == 9 and other.stopped_ns == 7
 
 
-def test_a_driver_that_latches_at_the_same_time_does_not_undo_the_named_reason() -> None:
-    memory = bytearray(LATCH_SIZE)
-    daemon, driver = Latch(memoryview(memory)), Latch(memoryview(memory))
-    assert daemon.stop(5, "eva: smoke")
-    daemon.name_source("eva: smoke")
-    memory[:8] = bytes(8)  # the driver has looked just before the daemon latched
-    assert driver.stop(6, "pid 7, through the stop-request page")
-    assert driver.source == "eva: smoke"
-    daemon.reset(1)
-    assert driver.stop(8, "input light") and daemon.source == "input light"
-
-
 def test_a_stop_and_reset_between_two_looks_shows() -> None:
     latch = Latch(memoryview(bytearray(LATCH_SIZE)))
     before = (latch.stopped_ns, latch.resets)

@@ -18,7 +18,6 @@ from sioms.daemon import stop_record
 from sioms.daemon.stop_record import StopRecord
 from sioms.protocol import stopjournal
 from sioms.protocol.stopjournal import (
-    MOST_ENDED,
     StopJournal,
     Stopped,
     channels_and_bits,
@@ -77,17 +76,36 @@ def test_a_stop_that_is_noted_behind_its_own_reset_is_over(path: str, monkeypatc
     """A driver notes a stop when it has done it; others may have seen it, and its reset, before."""
     monkeypatch.setattr(stop_record, "MOST_BYTES", 1)  # a checkpoint after every entry
     record = StopRecord(path)
-    for latched_ns in range(5, 5 + MOST_ENDED):
-        record.note(workcell_entry("ann", stop=True, named=True, latched_ns=latched_ns))
-        record.note(workcell_entry("ann", stop=False, latched_ns=latched_ns))
-    for latched_ns in range(5, 5 + MOST_ENDED):
-        record.note(workcell_entry("pid 7", stop=True, latched_ns=latched_ns))
+    for word in range(5, 9):
+        resets = record.state.resets
+        record.note(workcell_entry("ann", stop=True, named=True, resets=resets))
+        record.note(workcell_entry("ann", stop=False, resets=resets + 1, request=word))
+        for request in range(5, word + 1):
+            record.note(workcell_entry("pid 7", stop=True, resets=resets, request=request))
+        assert not record.state.workcell and not kept(path).workcell
+    for resets, request in ((4, 8), (4, 5), (3, 9), (3, 0), (0, 0)):
+        record.note(workcell_entry("bob", stop=True, resets=resets, request=request))
+        assert record.state.workcell == kept(path).workcell == "bob", "no other stop is taken for it"
+        record.note(workcell_entry("ann", stop=False, resets=4, request=max(request, 8)))
+
+
+def test_a_reset_ends_no_stop_that_it_has_not_answered(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A driver notes a request that the daemon has not heard when it resets, and may not live to tell."""
+    record = StopRecord(path)
+    record.note(workcell_entry("pid 7", stop=True, request=9))
+    record.note(workcell_entry("ann", stop=False, resets=1, request=8))
+    assert record.state.workcell == kept(path).workcell == "pid 7"
+    monkeypatch.setattr(stop_record, "MOST_BYTES", 1)  # a checkpoint
+    record.note(workcell_entry("ann", stop=False, resets=2, request=8))
+    assert record.state.workcell == kept(path).workcell == "pid 7"
+    record.note(workcell_entry("ann", stop=False, resets=3, request=9))
     assert not record.state.workcell and not kept(path).workcell
-    record.note(workcell_entry("bob", stop=True, latched_ns=4))
-    assert record.state.workcell == kept(path).workcell == "bob", "no other stop is taken for it, not an earlier one"
-    record.note(workcell_entry("ann", stop=False))
-    record.note(workcell_entry("bob", stop=True))
-    assert kept(path).workcell == "bob", "nor one of which that is not known"
+    record.note(workcell_entry("pid 7", stop=True, resets=3, request=20))
+    record.close()
+    record = StopRecord(path)
+    assert record.state.workcell == "pid 7"
+    record.note(workcell_entry("ann", stop=False, resets=4))
+    assert not record.state.workcell and not kept(path).workcell, "the words of another daemon's file say nothing"
 
 
 def test_a_bit_is_stopped_and_reset_by_itself(path: str) -> None:

@@ -68,7 +68,7 @@ class Device:
         self.ready, self.ring = np.zeros(64, dtype=np.int64), np.zeros(7 * RING, dtype=np.int64)
         given = {
             "poll": self.poll.fileno(), "timer": self.timer, "line_timer": self.line.fd, "ready": self.ready,
-            "latch": self.latch, "stopped": 0, "resets": 0, "orders": 0, "daemon_lease_ns": LEASE_NS,
+            "latch": self.latch, "is_stopped": 0, "stopped": 0, "resets": 0, "orders": 0, "daemon_lease_ns": LEASE_NS,
             "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns, "announced": 0,
             "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
             "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
@@ -276,7 +276,7 @@ def test_who_is_told_of_a_stop_brakes_and_ticks_before_the_loop_hears_of_it(make
 
 @pytest.mark.parametrize("why", ["answered", "seen", "stopped already", "reset", "refused", "kept", "left", "seldom"])
 def test_what_is_no_stop_for_steps_is_left_to_the_loop_at_once(make, why):
-    device = make(expired=0, lead_ns=100 * (why == "seldom"), stopped=5 * (why == "stopped already"))
+    device = make(expired=0, lead_ns=100 * (why == "seldom"), is_stopped=int(why == "stopped already"))
     device.stops, device.ticks_next = why == "refused", True
     requests = Requests(device)
     mark = requests.ask() if why != "seen" else (0, 0)
@@ -289,6 +289,13 @@ def test_what_is_no_stop_for_steps_is_left_to_the_loop_at_once(make, why):
     assert run(device.quiet) == 1
     assert not device.ticks and not device.quiet.brakes
     assert device.latched == [1] * (why == "refused")
+
+
+def test_who_is_stopped_by_a_request_ticks_on_when_the_daemon_latches_it(make):
+    device = make(is_stopped=1)
+    device.latch[STOPPED] = 5
+    assert one_tick(device.quiet) == DONE and not device.latched
+    assert (device.quiet.stopped, device.quiet.heeded_ns) == (5, 0)
 
 
 def test_a_tick_behind_a_stop_that_is_the_loops_is_handed_over(make):
@@ -310,7 +317,7 @@ def test_an_order_to_another_device_is_not_looked_at_by_the_loop(make):
 
 @pytest.mark.parametrize("what", ["an order", "a reset of who is stopped"])
 def test_who_waits_for_its_turn_ticks_on_and_shows_what_it_had_heeded(make, what):
-    device = make(began_ns=77, stopped=5 * (what != "an order"))
+    device = make(began_ns=77, is_stopped=int(what != "an order"))
     if what == "an order":
         device.latch[ORDERS] = 1
         os.eventfd_write(device.control, 1)
@@ -542,7 +549,7 @@ def test_steps_last_no_longer_than_waits_and_the_leases_of_clients(waits_ns, cli
     quiet = quiet_run(waits_ns, clients_ns)
     assert quiet.lend(1_000, 4, True)
     assert quiet.record.until_ns == until_ns
-    assert (quiet.record.stopped, quiet.record.resets, quiet.record.orders) == (3, 2, 1)
+    assert (quiet.record.is_stopped, quiet.record.stopped, quiet.record.resets, quiet.record.orders) == (1, 3, 2, 1)
 
 
 @pytest.mark.parametrize("why", ["a wait needs the loop", "the driver is not ready", "its pages cannot be lent"])
@@ -563,7 +570,7 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
     quiet = QuietRun(
         steps, record.poll.fileno(), record.timer, record.line.fd, record.control, record.latch, PERIOD_NS, 0, LEASE_NS,
         SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
-        SimpleNamespace(lend=lambda: lends), SimpleNamespace(seen=(3, 2, 1)),
+        SimpleNamespace(lend=lambda: lends), SimpleNamespace(stopped=True, seen=(3, 2, 1)),
         SimpleNamespace(until_ns=lambda: waits_ns, any=waits_ns < 2**62), SimpleNamespace(until_ns=lambda: clients_ns),
         statistics, SimpleNamespace(record=Desk.empty(), request=StopFile.empty(), lend=lambda: None),
     )  # fmt: skip
