@@ -20,6 +20,7 @@ NAMED = (
     "creep",
     "proximity",
     "strip_inhomogeneity",
+    "strip_peak",
     "adhesion",
     "sliding_friction",
     "mains_line",
@@ -38,6 +39,7 @@ MIXABLE = (
     "creep",
     "proximity",
     "strip_inhomogeneity",
+    "strip_peak",
     "adhesion",
     "mains_line",
     "force_gain",
@@ -149,6 +151,7 @@ def _effect(name: str, count: int, rng: np.random.Generator) -> dict[str, Array]
             "period": one(2 * np.pi / float(rng.integers(28, 48))),
             "phase": one(float(u(-3, 3))),
         },
+        "strip_peak": {"c": one(sign * float(u(0.06, 0.15))), "width": one(float(u(0.05, 0.12)))},
         "adhesion": {"share": one(float(u(0.4, 0.9)))},
         "sliding_friction": {"f": one(sign * float(u(0.15, 0.6)))},
         "mains_line": {

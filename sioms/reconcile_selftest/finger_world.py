@@ -78,6 +78,9 @@ class FingerWorld:
             )
             strain += 0.5 * weight * here.sum(1)
         out: Array = -strain / self.gain
+        if "strip_peak" in f.named:
+            away = (self.angle - middle) / self._one("strip_peak", "width")
+            out = out * (1.0 + self._one("strip_peak", "c") * np.exp(-(away**2)))
         if "strip_inhomogeneity" in f.named:  # of the layer: before whatever the elements make of its strain
             e = f.named["strip_inhomogeneity"]
             turn = 2 * np.pi * place / float(e["period"][0]) + float(e["phase"][0])

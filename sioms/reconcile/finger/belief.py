@@ -19,6 +19,7 @@ from sioms.tactile.cylinder import Cylinder, respond
 
 #: Poisson's ratios about the nominal one at which contacts are solved; between them series follow a parabola.
 _POISSON = (-0.07, 0.0, 0.035)
+_CORE = (-5e-4, 0.0, 5e-4)  # of the core likewise [m]
 _BELOW = (-0.08, -0.04, 0.0)  # where the nominal one is close to 1/2
 #: ``response(output, scene, parameters)`` returns the changed output, shape (touches, elements).
 Response = Callable[[Floats, "Scene", Floats], Floats]
@@ -66,9 +67,12 @@ class Belief:
         hertz, adhesion: shares of Hertz's widths and of full adhesion.
         friction: coefficient, positive where the indenter drags towards larger angles.
         apex: share of the apex's shift under sliding (0: the commanded place is the middle of contact).
-        around: Poisson's ratio about which contacts are solved, 0 for ``poisson`` itself.
+        around, about: Poisson's ratio and core [m] about which contacts are solved, 0 for the body's own.
         strip: half widths of contact vary by amplitude [1] and phase [rad] over a period of the place [rad].
         uneven: the linear output varies by amplitude [1] and phase [rad] over a period of the place [rad].
+        soft: share by which what a load does goes beyond it: strains depend on the load over the stiffness.
+        peak: the linear output is greater by amplitude [1] right under the touch, falling off as a Gaussian of a width
+            [rad].
         creep, creep_time: share of a step that comes late, and its time constant [s].
         cell: relative error of the load cell.
         temperature: drift of the output [1/K], shape (ns,); common: the part of it that all elements have.
@@ -92,8 +96,11 @@ class Belief:
     friction: float = 0.0
     apex: float = 0.0
     around: float = 0.0
+    about: float = 0.0
     strip: tuple[float, float, float] = (0.0, 0.0, 1.0)
     uneven: tuple[float, float, float] = (0.0, 0.0, 1.0)
+    soft: float = 0.0
+    peak: tuple[float, float] = (0.0, 1.0)
     creep: float = 0.0
     creep_time: float = 1.0
     cell: float = 0.0
@@ -129,7 +136,9 @@ class _Contact:
     friction: float
     apex: float
     around: float
+    about: float
     strip: tuple[float, float, float]
+    soft: float
 
     @property
     def body(self) -> Cylinder:
@@ -139,15 +148,22 @@ class _Contact:
 @lru_cache(maxsize=24)
 def _tractions(c: _Contact, scene: Scene) -> tuple[Complex, Complex]:
     """Return p and q of every touch per unit load at the believed Poisson's ratio."""
-    middle = c.around or c.poisson
-    nodes = [middle + d for d in (_POISSON if middle + _POISSON[2] < 0.5 else _BELOW)]
-    nearest = [c.poisson] if min(abs(v - c.poisson) for v in nodes) < 1e-9 else nodes
+    middle, stated = c.around or c.poisson, c.about or c.core
+    ratios = _parabola(c.poisson, [middle + d for d in (_POISSON if middle + _POISSON[2] < 0.5 else _BELOW)])
+    cores = _parabola(c.core, [stated + d for d in _CORE])
     p = q = np.zeros((len(scene.place), len(WAVES)), dtype=np.complex128)
-    for v in nearest:
-        weight = float(np.prod([(c.poisson - o) / (v - o) for o in nearest if o != v]))
-        own = _tractions_at(replace(c, poisson=v), scene)
-        p, q = p + weight * own[0], q + weight * own[1]
+    for poisson, by_ratio in ratios.items():
+        for core, by_core in cores.items():
+            own = _tractions_at(replace(c, poisson=poisson, core=core), scene)
+            p, q = p + by_ratio * by_core * own[0], q + by_ratio * by_core * own[1]
     return p, q
+
+
+def _parabola(at: float, nodes: list[float]) -> dict[float, float]:
+    """Return the nodes that a parabola at a place needs, with their weights."""
+    if min(abs(v - at) for v in nodes) < 1e-9:
+        return {at: 1.0}
+    return {v: float(np.prod([(at - o) / (v - o) for o in nodes if o != v])) for v in nodes}
 
 
 def _tractions_at(c: _Contact, scene: Scene) -> tuple[Complex, Complex]:
@@ -155,7 +171,8 @@ def _tractions_at(c: _Contact, scene: Scene) -> tuple[Complex, Complex]:
     p = np.empty((len(scene.place), len(WAVES)), dtype=np.complex128)
     q = np.zeros_like(p)
     half = np.empty(len(scene.place))
-    argument = np.where(edge, scene.load, scene.load / (1.0 / c.outer + 1.0 / np.where(edge, 1.0, scene.radius)))
+    load = scene.load * (1.0 + c.soft)
+    argument = np.where(edge, load, load / (1.0 / c.outer + 1.0 / np.where(edge, 1.0, scene.radius)))
     depth, phase, period = c.strip
     if depth:
         wider = 1.0 + depth * np.sin(2.0 * np.pi * scene.place / period + phase)
@@ -197,7 +214,8 @@ def strains(b: Belief, scene: Scene) -> Floats:
     """Return the strain of every element under every touch, shape (nt, ns)."""
     # what acts on nothing is left out of the key
     apex, strip = b.apex if b.friction else 0.0, b.strip if b.strip[0] else (0.0, 0.0, 1.0)
-    contact = _Contact(b.core, b.outer, b.shear, b.poisson, b.hertz, b.adhesion, b.friction, apex, b.around, strip)
+    body = b.core, b.outer, b.shear, b.poisson
+    contact = _Contact(*body, b.hertz, b.adhesion, b.friction, apex, b.around, b.about, strip, b.soft)
     return _strains(contact, scene, b.angle.tobytes(), tuple(np.round(b.radius, 10)), b.extent, b.offset)
 
 
@@ -212,15 +230,18 @@ def _strains(
     full = (p * turn) @ (by_p * here).T
     if c.friction or c.adhesion:
         full += (1j * q * turn) @ (by_q * here).T
-    out: Floats = full.real
+    out: Floats = full.real * (1.0 + c.soft)
     out.setflags(write=False)
     return out
 
 
 def outputs(b: Belief, scene: Scene) -> Floats:
     """Return the output of every element under every touch, without creep, shape (nt, ns)."""
-    seen = replace(scene, distance=b.angle - (scene.place + b.offset)[:, None])
+    away = b.angle - (scene.place + b.offset)[:, None]
+    seen = replace(scene, distance=away)
     linear = -strains(b, scene) / b.gain
+    if b.peak[0]:
+        linear = linear * (1.0 + b.peak[0] * np.exp(-((away / b.peak[1]) ** 2)))
     amplitude, phase, period = b.uneven
     if amplitude:
         linear = linear * (1.0 + amplitude * np.sin(2.0 * np.pi * scene.place / period + phase))[:, None]

@@ -46,6 +46,10 @@ def _poisson(b: Belief, v: Values) -> Belief:
     return replace(b, poisson=float(np.clip(b.poisson + v["dnu"][0], 0.0, 0.5)))
 
 
+def _core(b: Belief, v: Values) -> Belief:
+    return replace(b, core=min(b.core + float(v["dc"][0]), float(b.radius.min()) - 1e-4))
+
+
 def _drift(b: Belief, v: Values) -> Belief:
     return replace(b, temperature=b.temperature + v["k"], common=b.common + float(v["k"][0]))
 
@@ -72,6 +76,10 @@ def _strip(b: Belief, v: Values) -> Belief:
     return replace(b, uneven=loud, strip=wide)
 
 
+def _peak(b: Belief, v: Values) -> Belief:
+    return replace(b, peak=(float(v["c"][0]), float(v["width"][0])))
+
+
 def leaked(output: Floats, scene: Scene, p: Floats) -> Floats:
     """Add a share of both neighbours."""
     out = output.copy()
@@ -95,7 +103,7 @@ GAIN = SensorEffect(
     equation="gain_i = stated gain_i (1 + g_i)",
     parameters=(Quantity("g", "1", -0.9, 9.0, 0.1, "relative departure of each element's gain", each=True),),
     signature="output too large or too small in one proportion wherever and however it is touched, element by element",
-    lookalikes=("depth_scatter", "poisson", "strip_inhomogeneity"),
+    lookalikes=("depth_scatter", "poisson", "strip_inhomogeneity", "soft_skin"),
     separate="edge touches every degree across each element: depth changes the width of the profile, gain does not",
     twins=("depth_scatter", "strip_inhomogeneity"),
 )
@@ -144,6 +152,18 @@ POISSON = SensorEffect(
     signature="under the touch and beside it in another proportion, alike for all elements",
     lookalikes=("adhesion", "hertz", "gain_scatter", "depth_scatter"),
     separate="the same places with an edge and with a flat: adhesion needs a wide contact, Poisson's ratio does not",
+)
+CORE = SensorEffect(
+    name="core_radius",
+    title="a core of another radius",
+    channel=MECHANICS,
+    change=_core,
+    equation="ra = stated ra + dc",
+    parameters=(Quantity("dc", "m", -6e-4, 6e-4, 1e-4, "departure of the core's radius"),),
+    signature="profile wider and larger, or narrower and smaller, alike for all elements",
+    lookalikes=("poisson", "depth_scatter", "soft_skin", "strip_peak", "cross_talk"),
+    separate="the same places with an edge and with a flat, over a decade of loads",
+    twins=("depth_scatter",),
 )
 QUADRATIC = SensorEffect(
     name="quadratic",
@@ -197,6 +217,7 @@ CREEP = SensorEffect(
     signature="outputs go on rising (or fall) in one proportion while the load stays",
     lookalikes=("temperature_drift", "gain_scatter", "quadratic"),
     separate="one touch held for 30 s at constant temperature, and a temperature step at zero load",
+    twins=("gain_scatter",),
 )
 PROXIMITY = SensorEffect(
     name="proximity",
@@ -238,6 +259,20 @@ STRIP = SensorEffect(
     separate="touches in steps of less than half a period over several periods",
     twins=("gain_scatter",),
 )
+PEAK = SensorEffect(
+    name="strip_peak",
+    title="elements more sensitive right over their strips",
+    channel=SENSOR,
+    change=_peak,
+    equation="l_i = l_i (1 + c exp(-((t_i - t_c)/width)^2))",
+    parameters=(
+        Quantity("c", "1", -0.6, 1.5, 0.05, "how much more an element answers to what is right over it"),
+        Quantity("width", "rad", 0.02, 0.5, 0.03, "angle over which that falls to 1/e", starts=(0.04, 0.07, 0.12, 0.2)),
+    ),
+    signature="profile too high in its middle in one proportion at all loads, alike for all elements",
+    lookalikes=("depth_scatter", "poisson", "quadratic", "cross_talk", "gain_scatter", "proximity", "hertz"),
+    separate="edge touches every degree across each element, at a decade of loads",
+)
 ADHESION = SensorEffect(
     name="adhesion",
     title="the indenter sticks to the skin",
@@ -248,6 +283,18 @@ ADHESION = SensorEffect(
     signature="profile narrower the wider the contact, alike for all elements",
     lookalikes=("poisson", "hertz", "proximity"),
     separate="the same places with an edge and with a flat: adhesion needs a wide contact, Poisson's ratio does not",
+)
+SOFT = SensorEffect(
+    name="soft_skin",
+    title="softer skin, or a shorter contact, than stated",
+    channel=MECHANICS,
+    change=_added("soft", "s"),
+    equation="u(P) = stated u(P (1 + s)): strains go with the load over shear modulus and length of contact",
+    parameters=(Quantity("s", "1", -0.8, 4.0, 0.05, "stated over true stiffness and length of contact, less one"),),
+    signature="all outputs too large in one proportion, and contacts as wide as under larger loads",
+    lookalikes=("gain_scatter", "force_gain", "poisson", "creep", "hertz", "strip_peak"),
+    separate="a decade of loads at one place with an edge and with a flat; a known weight on the load cell",
+    twins=("gain_scatter",),
 )
 HERTZ = SensorEffect(
     name="hertz",
@@ -339,11 +386,14 @@ BUILT_IN = (
     OFFSET,
     DEPTH,
     POISSON,
+    CORE,
     HERTZ,
     ADHESION,
     SLIDING,
     CREEP,
     STRIP,
+    PEAK,
+    SOFT,
 )
 
 

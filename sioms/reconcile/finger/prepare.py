@@ -93,7 +93,9 @@ def prepare(
     still = reduce_untouched(by_name["thermal"], scale, lines, after_s=after) if "thermal" in by_name else None
     ramps = tuple(reduce_ramps(by_name["ramp"], scale, ~alive, lines)) if "ramp" in by_name else ()
     blur = nominal.blur or ((START_EXTENT * _pitch(nominal.angle)) ** 2 if refine_extent else 0.0)
-    base = replace(nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson, blur=blur)
+    base = replace(
+        nominal, angle=np.ascontiguousarray(nominal.angle), around=nominal.poisson, about=nominal.core, blur=blur
+    )
     library_ = {**library(), **{t.name: t for t in TERMS}}
     model = SensorModel(base, count, library_, {}, (BLUR,) if refine_extent else (), name)
     model, settled = _settle(model, lines, alive)

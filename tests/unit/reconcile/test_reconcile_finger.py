@@ -125,6 +125,28 @@ def test_every_effect_does_nothing_at_its_neutral_value_and_something_beside_it(
         assert changed or b.creep or b.cell or b.temperature.any(), name
 
 
+@pytest.mark.parametrize("radius", [0.0, 6e-3, np.inf])
+def test_a_softer_skin_is_one_of_a_smaller_shear_modulus(radius: float) -> None:
+    """Strains depend on the load over the stiffness."""
+    scene = scene_of(np.radians([60.0, 72.5]), np.array([80.0, 250.0]), np.full(2, radius))
+    soft = SensorModel(believed(), 16, library()).with_effect("soft_skin", {"s": np.array([0.25])})
+    wanted = outputs(believed(shear=FINGER_B.shear_pa / 1.25), scene)
+    np.testing.assert_allclose(outputs(soft.belief(), scene), wanted, atol=1e-5 * wanted.max())
+
+
+def test_an_element_more_sensitive_over_its_strip_is_so_in_the_simulated_finger() -> None:
+    finger = TactileArray(FingerShape(gain=3.0, length_m=0.012, strip_gain=0.1, strip_width_rad=0.09))
+    plain = TactileArray(FingerShape(gain=3.0, length_m=0.012))
+    peak = {"c": np.array([0.1]), "width": np.array([0.09])}
+    models = [m := SensorModel(believed(), 16, library()), m.with_effect("strip_peak", peak)]
+    for place in (1.2, 1.3, 1.31):
+        scene = scene_of(np.array([place]), np.array([200.0]), np.zeros(1))
+        before, after = (outputs(m.belief(), scene)[0] for m in models)
+        out = (f.read(2.4, place, 0.0, np.empty(16)) for f in (plain, finger))
+        was, now = (o.copy() for o in out)
+        np.testing.assert_allclose(after / before, now / was, rtol=1e-6)
+
+
 def test_look_alikes_are_effects_of_the_library() -> None:
     names = set(library())
     for effect in library().values():
