@@ -2,7 +2,8 @@
 
 Readers are in ten processes under three keys, each with a copy of the same device at 1 kHz, and read fifty times a
 second. They stand for other machines: on this one they take what processor time nobody else wants. Local figures come
-from before, beside and after them, so that a busy machine shows.
+from before, beside and after them, so that a busy machine shows, and of a client and a driver on one core, so that the
+same is compared (docs/decisions/1082-ratios-compare-the-same-place.md); all others are where the kernel puts them.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import time
 from functools import partial
 from typing import Any
 
-from sioms.check.daemon import CpuTimes, Daemon, wait_for
+from sioms.check.daemon import CpuTimes, Daemon, on_one_processor, wait_for
 from sioms.check.remote import Gateway
 from sioms.client.command import command
 from sioms.client.keys import VARIABLE, Folder
@@ -37,13 +38,13 @@ CHANGE = 1.1
 def _reader(address: str, folder: str, count: int, ready: mmap.mmap, place: int) -> None:
     """Have some sessions, and read in each of them now and then."""
     os.environ[VARIABLE] = folder
-    os.nice(19)
     with contextlib.ExitStack() as stack:
         nodes: list[Any] = []
         for _ in range(count):
             cell = stack.enter_context(Workcell(address, "reader"))
             nodes.append(stack.enter_context(cell.open("mod0.readonly")))
         ready[place] = 1
+        os.nice(19)  # not before: beside other work a hundred sessions would take a minute
         while True:
             for node in nodes:
                 with contextlib.suppress(OSError):  # stale: this process had no processor for long
@@ -58,18 +59,19 @@ def bench_crowd(options: Options, report: Report) -> None:
         Daemon(config) as daemon, Gateway(daemon.socket) as gateway, daemon.cell() as cell,
         cell.open("mod1", "rw") as node, cell.open("mod0.readonly") as other,
     ):  # fmt: skip
-        figures = [_measure(options, report, "without remote readers", node, other)]
+        local = partial(_measure, options, report, node, other, daemon.device_pids()["mod1"])
+        figures = [local("without remote readers")]
         pids = _begin(daemon, gateway)
         os.kill(pids[-1], signal.SIGSTOP)
         time.sleep(1.0)
         times = CpuTimes({"gateway": gateway.process.pid})
-        figures.append(_measure(options, report, f"beside {sum(PROCESSES)}, one stopped", node, other))
+        figures.append(local(f"beside {sum(PROCESSES)}, one stopped"))
         report.value("share of a core that the gateway takes meanwhile [%]", 100 * times.shares()["gateway"])
         for pid in pids:
             daemon.kill(pid)
             daemon.reap(pid)
         time.sleep(1.0)
-        figures.append(_measure(options, report, "when they have left", node, other))
+        figures.append(local("when they have left"))
     for what in figures[0]:
         without = statistics.mean(each[what] for each in (figures[0], figures[2]))
         report.value(
@@ -95,8 +97,16 @@ def _begin(daemon: Daemon, gateway: Gateway) -> list[int]:
     return pids
 
 
-def _measure(options: Options, report: Report, when: str, node: Any, other: Any) -> dict[str, float]:
+def _measure(options: Options, report: Report, node: Any, other: Any, driver: int, when: str) -> dict[str, float]:
     """Return medians of local reads and writes [ns]; writes come ten milliseconds apart and in a row."""
+    with on_one_processor(os.getpid(), driver):
+        taken = _calls(options, report, node, other, when)
+    for what, samples in taken.items():
+        report.samples(f"local {what}, {when}", samples)
+    return {what: statistics.median(samples) for what, samples in taken.items()}
+
+
+def _calls(options: Options, report: Report, node: Any, other: Any, when: str) -> dict[str, list[int]]:
     records = [command(0, position=p) for p in (1e-4, 0.0)]
     reads: list[int] = []
     rows: list[int] = []
@@ -112,7 +122,4 @@ def _measure(options: Options, report: Report, when: str, node: Any, other: Any)
             act()
             samples.append(clock() - begin)
         report.progress(f"crowd: {when}, {turn}")
-    taken = {"read": reads, "write, 10 ms apart": paced, "write, in a row": rows}
-    for what, samples in taken.items():
-        report.samples(f"local {what}, {when}", samples)
-    return {what: statistics.median(samples) for what, samples in taken.items()}
+    return {"read": reads, "write, 10 ms apart": paced, "write, in a row": rows}

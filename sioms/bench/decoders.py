@@ -502,7 +502,7 @@ TARGETS = {
             link.ping(3),
             link.pong(1, 2, 3, 4, 1),
             link.opened(link.PageShape(NodeClass.AXIS, 3, 64, 10**8, 2, 9), b"packet"),
-            link.Update(9, 1, 2, b"why", True, [bytes(8)]).packed(),
+            link.Update(9, 1, 2, b"why", True, 1, bytes(8)).packed(),
         ],
         (),
         2,

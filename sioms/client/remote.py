@@ -475,8 +475,7 @@ class _Bridge:
         """Write what has been told into the page, the state first: nobody shall take old for good."""
         alive_ns = self.clock.here(update.alive_ns)
         far.page.set_condition(alive_ns, update.driver, update.daemon, update.reason)
-        for raw in update.snapshots:
-            far.page.put(raw)
+        far.page.put_all(update.snapshots)
         if far.answer:
             far.hand_over(self.ours)
         elif update.wake:

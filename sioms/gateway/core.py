@@ -504,12 +504,13 @@ class Gateway:
         woken, held.woken = held.woken, False
         while session.held.get(held.handle) is held:
             last = min(head, first + most - 1)
-            news = [raw for raw in map(page.numbered, range(first, last + 1)) if raw is not None]
+            news = page.between(first, last)
             held.cursor, held.ahead = last, held.ahead + 1
-            if news and as_of_ns(news[-1]) >= held.owed_ns:
+            if news and as_of_ns(news[-shape.slot_size :]) >= held.owed_ns:
                 held.owed_ns = 0
             alive_ns, driver, daemon, reason = condition
-            update = Update(alive_ns, driver, daemon, reason, woken and last == head, news)
+            count = len(news) // shape.slot_size
+            update = Update(alive_ns, driver, daemon, reason, woken and last == head, count, news)
             self._send(session, Down.UPDATE, held.handle, update.packed())
             first = last + 1
             if first > head:

@@ -33,8 +33,8 @@ class Page(Protocol):
     def head(self) -> int:
         """Number of the newest snapshot."""
 
-    def numbered(self, number: int) -> bytes | None:
-        """Copy a snapshot by its number."""
+    def between(self, first: int, last: int) -> bytes:
+        """Copy the snapshots of these numbers that are there."""
 
     def condition(self) -> tuple[int, int, int, bytes]:
         """Return what readers judge the page by."""

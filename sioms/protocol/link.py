@@ -20,7 +20,6 @@ from .page import REASON_SIZE, slot_size
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Sequence
     from enum import IntEnum
 else:
     from .enumeration import IntEnum
@@ -172,23 +171,21 @@ class Update:
         alive_ns: when its driver was last seen alive, in the cell's clock.
         driver, daemon: state words, by PageState; reason: why one is not good, as in the page.
         wake: whether the driver has woken the subscriber.
-        snapshots: as they are in the page.
+        count, snapshots: how many snapshots, and these as they are in the page, one after the other.
     """
 
-    __slots__ = ("alive_ns", "daemon", "driver", "reason", "snapshots", "wake")
+    __slots__ = ("alive_ns", "count", "daemon", "driver", "reason", "snapshots", "wake")
 
     def __init__(
-        self, alive_ns: int, driver: int, daemon: int, reason: bytes, wake: bool, snapshots: Sequence[bytes]
+        self, alive_ns: int, driver: int, daemon: int, reason: bytes, wake: bool, count: int, snapshots: bytes
     ) -> None:
         self.alive_ns, self.driver, self.daemon = alive_ns, driver, daemon
-        self.reason, self.wake, self.snapshots = reason, wake, snapshots
+        self.reason, self.wake, self.count, self.snapshots = reason, wake, count, snapshots
 
     def packed(self) -> bytes:
         """Return the body of UPDATE."""
-        head = _UPDATE.pack(
-            self.alive_ns, self.driver, self.daemon, self.wake, len(self.reason), len(self.snapshots)
-        )  # fmt: skip
-        return b"".join((head, self.reason, *self.snapshots))
+        head = _UPDATE.pack(self.alive_ns, self.driver, self.daemon, self.wake, len(self.reason), self.count)
+        return head + self.reason + self.snapshots
 
     @classmethod
     def take(cls, body: bytes, size: int) -> Update:
@@ -204,8 +201,7 @@ class Update:
         start = _UPDATE.size + length
         if length > REASON_SIZE or len(body) != start + count * size:
             raise MalformedFrame(f"{count} snapshots of {size} bytes in {len(body)}")
-        snapshots = [body[at : at + size] for at in range(start, len(body), size)]
-        return cls(alive_ns, driver, daemon, body[_UPDATE.size : start], bool(wake), snapshots)
+        return cls(alive_ns, driver, daemon, body[_UPDATE.size : start], bool(wake), count, body[start:])
 
 
 def take_credit(body: bytes) -> int:

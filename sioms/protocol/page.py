@@ -217,6 +217,32 @@ class PageCopy(PageWriter):
         words[_HEAD] = number
         self._number = number
 
+    def put_all(self, raw: bytes) -> None:
+        """Publish snapshots of the other page, one after the other, as ``put`` each; a run of numbers goes at once."""
+        size, numbers = self._size, memoryview(raw).cast("Q")[:: self._size >> 3].tolist()
+        if not numbers or numbers[0] <= self._number or numbers != list(range(numbers[0], numbers[0] + len(numbers))):
+            for at in range(0, len(raw), size):
+                self.put(raw[at : at + size])
+            return
+        at = 0
+        while at < len(numbers):
+            start = numbers[at] & self._mask
+            count = min(len(numbers) - at, self._mask + 1 - start)
+            self._put_run(start, count, bytearray(raw[at * size : (at + count) * size]))
+            at += count
+
+    def _put_run(self, start: int, count: int, run: bytearray) -> None:
+        offset, step = HEADER_SIZE + start * self._size, self._size >> 3
+        theirs = memoryview(run).cast("Q")[::step]
+        ours = self._words[offset >> 3 : (offset >> 3) + count * step : step]
+        numbers = memoryview(theirs.tobytes()).cast("Q")
+        ours[:] = theirs[:] = memoryview(bytes(8 * count)).cast("Q")
+        fence()
+        self._bytes[offset : offset + count * self._size] = run
+        fence()
+        ours[:] = numbers
+        self._number = self._words[_HEAD] = numbers[-1]
+
     def set_condition(self, alive_ns: int, driver: int, daemon: int, reason: bytes = b"") -> None:
         """Set what readers judge the page by: when its driver was alive, both states, and why one is not good."""
         words = self._words
@@ -336,6 +362,20 @@ class PageReader:
         if number > 0 and self._words[offset >> 3] == number and raw[:8] == number.to_bytes(8, "little"):
             return raw
         return None
+
+    def between(self, first: int, last: int) -> bytes:
+        """Copy the snapshots of these numbers, one after the other, but for those that are overwritten or not there."""
+        size, start = self._size, first & self._mask
+        before_end = min(last + 1 - first, self.slots - start)
+        raw: bytes = self._buffer[HEADER_SIZE + start * size : HEADER_SIZE + (start + before_end) * size]
+        if before_end < last + 1 - first:
+            raw += self._buffer[HEADER_SIZE : HEADER_SIZE + (last + 1 - first - before_end) * size]
+        fence()
+        # The writer comes to the first one's slot when the one before it in the ring has become the head.
+        is_whole = self._words[_HEAD] < first + self._mask
+        if is_whole and memoryview(raw).cast("Q")[:: size >> 3].tolist() == list(range(first, last + 1)):
+            return raw
+        return b"".join([one for one in map(self.numbered, range(first, last + 1)) if one is not None])
 
     def slots_view(self) -> memoryview:
         """Return the memory of the ring as 8-byte words, for who takes many snapshots at once.
