@@ -17,8 +17,8 @@ if TYPE_CHECKING:
 
 #: State of axes of a running cell. A recording has none unless it is given: its axes may have the same names.
 STATE = Path("watch.json")
-#: Exit status: nothing has drifted; something has, with a name; its cause is open.
-NORMAL, NAMED, OPEN_CAUSE = 0, 3, 4
+#: Exit status: nothing has drifted; a part of the recording is lost; something has, with a name; its cause is open.
+NORMAL, DAMAGED, NAMED, OPEN_CAUSE = 0, 1, 3, 4
 
 
 def add_parser(kinds: Any) -> None:
@@ -108,9 +108,12 @@ def _over_recording(args: argparse.Namespace, say: Callable[[str], None]) -> int
             say(f"{name}: {text or 'as it was'}")
         told[name] = "" if drift is None else drift.name or " "
 
-    axes = from_recording(args.recording, args.nodes, _maker(args), judged)
+    axes, lost = from_recording(args.recording, args.nodes, _maker(args), judged)
     keep(args.state, axes, offset_s)
-    return _report(args, axes, offset_s)
+    status = _report(args, axes, offset_s)
+    for text in lost:
+        say(f"{args.recording}: {text}")
+    return DAMAGED if lost else status
 
 
 def _beside(args: argparse.Namespace, say: Callable[[str], None]) -> int:

@@ -236,8 +236,11 @@ def kept_axes(path: Path, nodes: Sequence[str], models: Mapping[str, AxisModel])
 
 def from_recording(
     path: Path, nodes: Sequence[str], make: Callable[[NodeInfo], Watched], judged: Callable[[Watched], None]
-) -> dict[str, Watched]:
+) -> tuple[dict[str, Watched], tuple[str, ...]]:
     """Watch over a recording.
+
+    Returns:
+        The axes by name, and what of the recording is lost, a sentence each.
 
     Raises:
         OSError: it cannot be read, or has no such node.
@@ -253,7 +256,8 @@ def from_recording(
             for slots in recording.slots(name):
                 if axis.feed(slots, None):
                     judged(axis)
-    return found
+        lost = tuple(dict.fromkeys(recording.damage))
+    return found, lost
 
 
 # --- beside a cell -------------------------------------------------------------------------------
