@@ -68,6 +68,27 @@ class Lag:
         np.add(force, gap, out=force)
 
 
+class SlewLimit:
+    """Limited rate of change: mean over the tick of the ramp towards a held command."""
+
+    def __init__(self, effect: Effect, tick_s: float) -> None:
+        self._most = effect.values["rate"] * tick_s  # in a tick
+        self._output, self._step, self._way = np.zeros((3, self._most.size))
+
+    def apply(self, force: Array) -> None:
+        """Replace the command by the mean output of this tick."""
+        output, step, way = self._output, self._step, self._way
+        np.subtract(force, output, out=way)
+        np.minimum(way, self._most, out=step)
+        np.maximum(step, -self._most, out=step)
+        np.add(output, step, out=output)
+        # a ramp that lasts for a share |step| / most of the tick is behind its end by half the step for so long
+        np.copyto(force, output)
+        np.multiply(step, np.abs(step), out=way)
+        np.divide(way, -2.0 * self._most, out=way)
+        np.add(force, way, out=force)
+
+
 class Saturation:
     """Clips between -limit_minus and limit."""
 
@@ -104,10 +125,12 @@ class ThermalGain:
         np.divide(force, work, out=force)
 
 
-# In the order of a drive: the command travels, the current loop follows it and limits, the motor weakens.
+# In the order of a drive: the command travels and is limited in rate, the current loop follows and limits, the motor
+# weakens.
 _ORDER: dict[str, Callable[[Effect, float], DriveEffect]] = {
     "delay": Delay,
     "lag": Lag,
+    "slew_limit": SlewLimit,
     "saturation": Saturation,
     "thermal_gain": ThermalGain,
 }

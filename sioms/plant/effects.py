@@ -119,6 +119,11 @@ CATALOGUE: Mapping[str, Kind] = {
     "payload": Kind(Place.PARAMETER, "further mass or inertia", {"mass": Parameter("mass", low=0.0)}),
     "delay": Kind(Place.DRIVE, "transport delay of the command", {"delay_s": Parameter("s", low=0.0, high=1.0)}),
     "lag": Kind(Place.DRIVE, "first-order lag of the drive", {"tau_s": Parameter("s", low=0.0)}),
+    "slew_limit": Kind(
+        Place.DRIVE,
+        "the force of the drive changes no faster than this",
+        {"rate": Parameter("force/s", low=1e-12, neutral=math.inf)},
+    ),
     "saturation": Kind(
         Place.DRIVE,
         "the drive gives no more than this",
@@ -227,6 +232,11 @@ CATALOGUE: Mapping[str, Kind] = {
     "encoder_eccentricity": Kind(
         Place.ENCODER,
         "reading = x + amplitude sin(2 pi x/pitch + phase)",
+        {"amplitude": Parameter("position"), "pitch": _PITCH, "phase": _PHASE},
+    ),
+    "encoder_interpolation": Kind(
+        Place.ENCODER,
+        "reading = x + amplitude sin(2 pi x/pitch + phase) within the signal period pitch",
         {"amplitude": Parameter("position"), "pitch": _PITCH, "phase": _PHASE},
     ),
     "encoder_quantisation": Kind(

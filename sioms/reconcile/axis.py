@@ -24,6 +24,7 @@ from sioms.reconcile.excitation import Gate, gate
 from sioms.reconcile.fit import refit
 from sioms.reconcile.form import of_any_form
 from sioms.reconcile.halves import on_halves
+from sioms.reconcile.locked import INTERPOLATION, locked
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import Options, Prepared, noise_read, prepare, reread, searched
@@ -51,6 +52,8 @@ from sioms.reconcile.timed import Timed, known_beside
 from sioms.reconcile.tones import as_timed, hum
 from sioms.reconcile.variation import named as varied
 
+#: A force of any period, and its first guess over the rated one.
+WAVY, GUESS = "cogging", 0.01
 AGAIN = 2  # times that the noise is taken again at most
 
 
@@ -273,15 +276,40 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
             ready = ready.beside(beside)
             start, earlier = ready.model, ()
             continue
-        start = found.fit.model
+        misread = _misread(ready, searcher, found) if turn < AGAIN else None
+        start = misread or found.fit.model
         anew = noise_read(ready.problem, start)
-        if turn == AGAIN or anew.noise.drive > FELL * ready.problem.noise.drive:
+        fell = anew.noise.drive <= FELL * ready.problem.noise.drive
+        if turn == AGAIN or not (misread or fell):
             break
-        o.progress(f"the noise is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
+        what = "what is taken for noise" if misread else "the noise"
+        o.progress(f"{what} is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
         earlier = found.ladder
         final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
         ready = replace(ready, problem=anew, final=final)
     return ready, excited, searcher, found
+
+
+def _misread(ready: Prepared, searcher: Searcher, found: Found) -> AxisModel | None:
+    """Return the model with an encoder that errs within its signal period, where a wave of what is taken for noise is
+    surely that and no force of the same period; None where there is none.
+    """
+    fit = found.fit
+    if INTERPOLATION not in ready.names or INTERPOLATION in fit.model.effects:
+        return None
+    wave = locked(searcher.problem, fit)
+    starts = searcher.screen(fit, (INTERPOLATION,)) if wave is not None else []
+    if not starts or wave is None:
+        return None
+    erring = searcher.fit(fit.model.with_effect(INTERPOLATION, starts[0].values))
+    pull = fit.model.effects.get(WAVY, {"amp2": 0.0, "phase2": 0.0})
+    size = GUESS * fit.model.rated_force
+    forces = [
+        searcher.fit(fit.model.with_effect(WAVY, {**pull, "amp": size, "phase": phase, "n": float(wave.order)}))
+        for phase in (0.0, 0.5 * np.pi)
+    ]
+    gain, sure = better(searcher.loss(erring), searcher.loss(min(forces, key=lambda f: f.cost)))
+    return erring.model if gain > 0.5 * wave.share and sure > SURE else None
 
 
 def _larger(searcher: Searcher, found: Found, excited: Gate) -> tuple[Found, Gate]:

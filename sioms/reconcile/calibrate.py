@@ -11,6 +11,7 @@ from sioms.reconcile.checks import LEAST_COUNTS
 from sioms.reconcile.effect import Array
 from sioms.reconcile.fit import Problem, block_ids, refit
 from sioms.reconcile.floor import lap
+from sioms.reconcile.locked import read_right
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import Noise, observer, sensor_noise
 from sioms.reconcile.records import Session
@@ -39,7 +40,7 @@ def calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
     laps = [lap(r, model.sample_time_s) for r in session.records]
     stiffness = model.inertia * (2.0 * np.pi * UNMEASURED_HZ) ** 2
     coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
-    sensor = sensor_noise(session, model.resolution * coarse)
+    sensor = sensor_noise(read_right(session, model), model.resolution * coarse)
     problem = replace(problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive))
     for _ in range(2):
         if any(laps):

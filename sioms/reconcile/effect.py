@@ -85,6 +85,7 @@ class Seen:
         pitch, max_speed: of the axis.
         force: largest force in the records; travel: range of motion of the longest.
         bounces: whether something in the model does.
+        waves: how often in a pitch waves come that the residual has, the strongest first.
     """
 
     scales: Mapping[str, float]
@@ -93,6 +94,7 @@ class Seen:
     force: float
     travel: float
     bounces: bool
+    waves: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +131,7 @@ class Ref(Enum):
     ONE = "1"
     PER_FORCE = "1 / rated force"
     FORCE = "rated force"
+    RISE = "rated force / s"
     INERTIA = "nominal inertia"
     DAMPING = "rated force / largest speed"
     STIFFNESS = "rated force / pitch"

@@ -54,8 +54,12 @@ call = caller()
     VARY_A,
     VARY_PHASE,
     VARY_N,
+    SLEW,
+    ERR_AMP,
+    ERR_PHASE,
+    ERR_N,
     PLANT_SIZE,
-) = range(31)
+) = range(35)
 # Places in the controller row.
 CTL_K, CTL_KZ, CTL_KP, CTL_KB, CTL_OFFSET, CTL_MAX, CTL_ALPHA, CTL_MEAN, CTL_SIZE = range(9)
 # Columns of the output.
@@ -117,6 +121,15 @@ def delayed(u: Array, before: float, n: int, start: float, end: float, delay: fl
     uj = u[j] if j >= 0 else before
     cut = j * dt
     return (ui * (cut - a) + uj * (b - cut)) / (b - a)
+
+
+@inlined
+def ramped(start: float, goal: float, rate: float, h: float) -> tuple[float, float]:
+    """Follow a goal at a rate of change at most for a time h: return the mean over it and the end."""
+    way = 1.0 if goal > start else -1.0
+    lasts = min(np.abs(goal - start) / rate, h)
+    end = goal if lasts < h else start + way * rate * h
+    return end - 0.5 * way * rate * lasts * lasts / h, end
 
 
 @inlined
@@ -188,6 +201,7 @@ def march(
     jm = total - jl
     # Local copies: a function that is called by its address might have changed an array.
     viscous, limit, delay, lag, loss = plant[VISCOUS], plant[LIMIT], plant[DELAY], plant[LAG], plant[LOSS]
+    slew = plant[SLEW]
     hyst_f, hyst_s, mod, gain_y = plant[HYST_F], plant[HYST_S], plant[MOD_A], plant[GAIN_Y]
     wave = (plant[VARY_A], plant[VARY_N] * plant[TURN_X], plant[VARY_PHASE])
     decay = np.exp(-h / lag) if lag > 0.0 else 0.0
@@ -195,7 +209,7 @@ def march(
     x, v, temp = start[0], start[1], start[2]
     xl, vl = x - start[5], v - start[6]
     held = start[4]
-    lagged = held
+    lagged = slewed = held
     hyst = 0.0
     e_old, u_old, y_old, y_older, v_f = start[3], start[4], 0.0, 0.0, gain_y * v
     off = 0
@@ -205,6 +219,8 @@ def march(
         y = gain_y * x
         if plant[ECC_AMP] != 0.0:
             y += plant[ECC_AMP] * np.sin(plant[TURN_X] * x + plant[ECC_PHASE])
+        if plant[ERR_AMP] != 0.0:
+            y += plant[ERR_AMP] * np.sin(plant[ERR_N] * plant[TURN_X] * x + plant[ERR_PHASE])
         if closed:
             if plant[QUANTUM] > 0.0:
                 y = np.round(y / plant[QUANTUM]) * plant[QUANTUM]
@@ -249,6 +265,8 @@ def march(
             ua = u
             if delay > 0.0:
                 ua = delayed(u_all, held, i, s * h, (s + 1) * h, delay, dt)
+            if slew > 0.0:
+                ua, slewed = ramped(slewed, ua, slew, h)
             if lag > 0.0:
                 nxt = ua + (lagged - ua) * decay
                 ua = ua + (lagged - ua) * (1.0 - decay) * lag / h

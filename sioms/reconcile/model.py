@@ -103,7 +103,7 @@ class AxisModel:
     def scale(self, parameter: Parameter) -> float:
         """Natural size of a parameter on this axis, in its own unit."""
         match parameter.ref:
-            case Ref.FORCE:
+            case Ref.FORCE | Ref.RISE:
                 return self.rated_force
             case Ref.PER_FORCE:
                 return 1.0 / self.rated_force

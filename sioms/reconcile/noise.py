@@ -16,7 +16,7 @@ from scipy.signal import lfilter, ss2tf
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.records import Session
+from sioms.reconcile.records import Record, Session
 
 #: Relative drive noise assumed where no force was measured; refined from the innovations afterwards.
 DRIVE_NOISE_DEFAULT = 0.004
@@ -148,17 +148,17 @@ def sensor_noise(session: Session, resolution: float) -> float:
 
 
 def drive_noise(
-    session: Session, rated_force: float, delivered: Callable[[Array], Array] = lambda force: force
+    session: Session, rated_force: float, delivered: Callable[[Record], Array] = lambda record: record.force
 ) -> float:
     """Standard deviation of measured minus delivered force above the control bandwidth.
 
     Args:
-        delivered: what a drive without noise makes of a command: late, slow or limited.
+        delivered: what a drive without noise makes of the command of a record: late, slow or limited.
     """
     found = []
     for r in session.records:
         if r.force_measured is not None:
-            second = np.diff(r.force_measured - delivered(r.force), 2)
+            second = np.diff(r.force_measured - delivered(r), 2)
             found.append(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
     floor = 1e-4 * rated_force
     return float(max(np.median(found), floor)) if found else DRIVE_NOISE_DEFAULT * rated_force

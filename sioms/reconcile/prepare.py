@@ -9,15 +9,17 @@ from typing import Any
 import numpy as np
 
 from sioms.reconcile.calibrate import calibrated
-from sioms.reconcile.channels import Finding, drive, drive_output, index_fit, index_scale, lattice
+from sioms.reconcile.channels import Finding, index_fit, index_scale, lattice
 from sioms.reconcile.checks import check
 from sioms.reconcile.contradictions import check_law, usable
 from sioms.reconcile.controlled import runs_the_loop
+from sioms.reconcile.current import Law, drive, speeds
 from sioms.reconcile.effects import library
 from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.experiment import Envelope
 from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
 from sioms.reconcile.imposed import carried
+from sioms.reconcile.locked import INTERPOLATION, read_right
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.polled import evened
@@ -204,21 +206,11 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
     for f in findings:
         model = model.with_effect(f.effect, dict(f.values))
     factor = coarse.values["factor"] if coarse is not None else 1.0
-    late = {symbol: value for f in driven for symbol, value in f.values.items()}
+    law, dt = Law.of(driven), nominal.sample_time_s
     noise = observer(
         nominal,
         sensor_noise(seen, nominal.resolution * factor),
-        drive_noise(
-            seen,
-            nominal.rated_force,
-            lambda force: drive_output(
-                force,
-                late.get("delay", 0.0),
-                late.get("tau", 0.0),
-                late.get("limit", np.inf),
-                nominal.sample_time_s,
-            ),
-        ),
+        drive_noise(seen, nominal.rated_force, lambda r: law.output(r.force, dt, speeds(r, dt))),
     )
     skip = max(SKIP, round(SKIP_S / nominal.sample_time_s))
     problem = Problem(session, noise, skip, end=1.0 if session.final else 1.0 - UNTOUCHED, mapper=quiet(o.mapper))
@@ -231,7 +223,7 @@ def _channels(session: Session, nominal: AxisModel, notes: Sequence[str], o: Opt
     if index_fit(seen, nominal) is not None:
         excluded.add("encoder_scale")
     if any(r.force_measured is not None for r in session.records):
-        excluded |= {"delay", "lag", "saturation"}
+        excluded |= {"delay", "lag", "slew_limit", "saturation", "supply_limit"}
     excluded |= set(o.without)
     names = tuple(n for n, e in library().items() if e.rankable and nominal.applicable(e) and n not in excluded)
     final = replace(problem, begin=1.0 - UNTOUCHED, end=1.0)
@@ -267,6 +259,10 @@ def noise_read(problem: Problem, model: AxisModel) -> Problem:
     """Return the problem with the noise that its own samples show, and none after them."""
     records = tuple(r.cut(0, problem.span(r).stop) for r in problem.session.records)
     own = replace(problem, session=replace(problem.session, records=records), end=1.0)
+    if INTERPOLATION in model.effects:  # which had been taken for noise
+        coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
+        sensor = sensor_noise(read_right(own.session, model), model.resolution * coarse)
+        own = replace(own, noise=observer(model, sensor, own.noise.drive))
     return replace(problem, noise=calibrated(own, own.session, model).noise)
 
 

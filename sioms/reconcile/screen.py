@@ -22,10 +22,12 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.effects.smooth import SIDE
 from sioms.reconcile.engine.search import Start
 from sioms.reconcile.fit import Fit, Problem
+from sioms.reconcile.locked import INTERPOLATION, waves
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import replay
 from sioms.reconcile.variation import room_for
 
+MANY = 3  # waves of a residual with each of which an error within a signal period is tried
 FEW = 4  # trials that further values are tried with
 #: First guesses of the level at speed and of the breakaway level, of a level that stood for both.
 DROPS = ((1.0, 1.4), (0.85, 1.05))
@@ -328,8 +330,14 @@ def _values(
     return values
 
 
-def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator[dict[str, float]]:
-    """Yield trial values of an effect that is no force of the state."""
+def trial_values(
+    effect: Effect, model: AxisModel, problem: Problem, waves: tuple[int, ...] = ()
+) -> Iterator[dict[str, float]]:
+    """Yield trial values of an effect that is no force of the state.
+
+    Args:
+        waves: how often in a pitch waves come that a residual has.
+    """
     start = {p.symbol: p.start * model.scale(p) for p in effect.parameters}
     records = problem.session.records
     seen = Seen(
@@ -339,6 +347,7 @@ def trial_values(effect: Effect, model: AxisModel, problem: Problem) -> Iterator
         max(float(np.max(np.abs(r.force))) for r in records),
         max(float(np.ptp(r.position)) for r in records),
         rattles(model),
+        waves,
     )
     for guess in effect.trials.guesses(seen) if effect.trials is not None else ():
         yield {**start, **guess}
@@ -351,7 +360,10 @@ def _screen_trials(
     has a sign.
     """
     model, way = room_for(fit.model, effect.name), effect.trials or Trials(lambda seen: ())
-    trials = [{**t, **levels} for t in trial_values(effect, model, problem)]
+    at = tuple(w.order for w in waves(problem, fit, most=MANY)) if effect.name == INTERPOLATION else ()
+    if effect.name == INTERPOLATION and not at:
+        return []
+    trials = [{**t, **levels} for t in trial_values(effect, model, problem, at)]
     if effect.joins:
         trials = _beside(trials, fit.model, effect)
     best = _scored(problem, fit, model, effect, trials, q, rest, stretched=not levels)

@@ -197,8 +197,10 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
 
 def _true_place(plant: Array, y: float) -> float:
     """Where the axis is when its sensor reads ``y``."""
-    turned = y / plant[k.GAIN_Y] * plant[k.TURN_X] + plant[k.ECC_PHASE]
-    return float((y - plant[k.ECC_AMP] * np.sin(turned)) / plant[k.GAIN_Y])
+    turned = y / plant[k.GAIN_Y] * plant[k.TURN_X]
+    error = plant[k.ECC_AMP] * np.sin(turned + plant[k.ECC_PHASE])
+    error += plant[k.ERR_AMP] * np.sin(plant[k.ERR_N] * turned + plant[k.ERR_PHASE])
+    return float((y - error) / plant[k.GAIN_Y])
 
 
 def _first_speed(position: Array, dt: float) -> float:

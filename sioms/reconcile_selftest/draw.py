@@ -51,12 +51,15 @@ NAMED = (
     "delay",
     "lag",
     "saturation",
+    "slew_limit",
+    "supply_limit",
     "thermal_gain",
     "dead_band",
     "gain_asymmetry",
     "encoder_scale",
     "encoder_quantisation",
     "eccentricity",
+    "interpolation_error",
 )
 NAMELESS = (
     "falling_drag",
@@ -66,9 +69,6 @@ NAMELESS = (
     "knocks",
     "stop",
     "detent",
-    "supply_limit",
-    "slew",
-    "interpolation",
 )
 #: Effects that are hidden from a solver who must do without them: unmet, and like nothing else in the library.
 UNMET = (
@@ -85,7 +85,7 @@ UNMET = (
 #: the range.
 EXCLUSIVE = (
     ("coulomb", "coulomb_position", "stribeck", "presliding", "lugre"),
-    ("delay", "lag", "saturation"),
+    ("delay", "lag", "saturation", "slew_limit", "supply_limit"),
     ("elastic", "backlash", "swinging_load"),
     ("gravity", "spring", "hardening_spring", "asymmetric_spring"),
     ("viscous", "quadratic_drag", "power_drag"),
@@ -93,6 +93,7 @@ EXCLUSIVE = (
     ("load_friction", "load_square_friction", "dead_band"),
     ("thermal_gain", "warming_friction"),
     ("encoder_quantisation", "backlash"),
+    ("encoder_quantisation", "interpolation_error"),
 )
 #: Laws of dry friction, of which one is beside a variation of it.
 VARYING = ("stribeck", "presliding", "lugre")
@@ -112,6 +113,8 @@ SAMPLES_S = (0.005, 0.002, 0.001, 0.001, 0.001, 0.0005, 0.00025)
 CHATTER, COARSE = 0.1, 0.5
 #: In how many of the samples a drive saturates, and a controller at most.
 SATURATED, AT_LIMIT = (0.03, 0.35), 0.02
+#: A drive of a limited rate is as far behind its command as this share of the rated force, root mean square.
+BEHIND = 0.04
 #: A thermal loss is of such a share in the end; a small range is within this angle [rad].
 WARM, SMALL = (0.06, 0.4), 0.4
 TRIES, DRY_RUN_S = 200, 5.0
@@ -143,9 +146,13 @@ def _sound(axis: Axis) -> bool:
         share = float(np.mean(force[:4] > axis.named["saturation"]["limit"]))
         if not SATURATED[0] < share < SATURATED[1]:
             return False
-    if "supply_limit" in axis.nameless:
-        share = float(np.mean(force[:4] > 0.8 * axis.nameless["supply_limit"]["F0"]))
+    if "supply_limit" in axis.named:
+        share = float(np.mean(force[:4] > 0.8 * axis.named["supply_limit"]["F0"]))
         if not SATURATED[0] < share < SATURATED[1]:
+            return False
+    if "slew_limit" in axis.named:  # the chatter of a count may be steep, and moves nothing
+        behind = np.array([r.force_measured - r.force for r in runs[:4]])
+        if float(np.sqrt(np.mean(behind**2))) < BEHIND * axis.rated:
             return False
     if "thermal_gain" in axis.named and not WARM[0] < axis.named["thermal_gain"]["loss"] * world.heat < WARM[1]:
         return False
@@ -405,9 +412,9 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
             return {"amp": f * u(0.1, 0.2), "x0": reach * u(-0.2, 0.2), "width": reach * u(0.06, 0.12)}
         case "supply_limit":
             return {"F0": f * u(0.3, 0.6), "v0": v * u(1.0, 1.6)}
-        case "slew":
+        case "slew_limit":
             return {"rate": f / (lost * u(8.0, 30.0))}
-        case "interpolation":
+        case "interpolation_error":
             n = float(rng.integers(32, 129))
             return {"amp": max(x / n * u(0.01, 0.04), 3.0 * q), "n": n, "phase": phase}
         case _:

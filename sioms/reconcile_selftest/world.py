@@ -135,10 +135,10 @@ class Plant(NamedTuple):
     detent_width: float = 1.0
     supply_limit_F0: float = np.inf
     supply_limit_v0: float = 1.0
-    slew_rate: float = np.inf
-    interpolation_amp: float = 0.0
-    interpolation_n: float = 0.0
-    interpolation_phase: float = 0.0
+    slew_limit_rate: float = np.inf
+    interpolation_error_amp: float = 0.0
+    interpolation_error_n: float = 0.0
+    interpolation_error_phase: float = 0.0
     knocks_height: float = 0.0
     knocks_count: float = 0.0
 
@@ -272,7 +272,7 @@ def _march(
     e_old = u_old = y_old = y_older = speed = slewed = 0.0
     for i in range(len(command)):
         seen = p.encoder_scale_gain * x + p.eccentricity_amp * np.sin(turn * x + p.eccentricity_phase)
-        seen += p.interpolation_amp * np.sin(p.interpolation_n * turn * x + p.interpolation_phase)
+        seen += p.interpolation_error_amp * np.sin(p.interpolation_error_n * turn * x + p.interpolation_error_phase)
         counts[i] = int(np.floor((seen + jitter[i]) / quantum + 0.5) * np.round(p.encoder_quantisation_factor))
         y = counts[i] * p.resolution
         if i == 0:
@@ -289,7 +289,7 @@ def _march(
         before, passed, mean = np.floor(x / p.pitch), False, 0.0
         for s in range(sub):
             goal = _held(queue, late + i + s / sub - p.delay_delay / p.sample_s, 1.0 / sub)
-            slewed += min(max(goal - slewed, -p.slew_rate * h), p.slew_rate * h)
+            slewed += min(max(goal - slewed, -p.slew_limit_rate * h), p.slew_limit_rate * h)
             goal = slewed
             drive = lagged + 0.5 * follow * (goal - lagged) if p.lag_tau > 0.0 else goal
             lagged += follow * (goal - lagged)

@@ -64,6 +64,23 @@ def test_a_drive_that_is_stronger_one_way_leaves_a_speed_behind() -> None:
     assert abs(moved(AXIS, push).v[-1]) < 1e-9
 
 
+def test_a_drive_of_a_limited_rate_lacks_the_impulse_of_its_ramps() -> None:
+    """Up by 5 N at 100 N/s takes 50 ms and half the impulse of these; down it has that more."""
+    push = np.concatenate([np.zeros(10), np.full(200, 5.0), np.zeros(100)])
+    run = moved(AXIS.with_effect("slew_limit", {"rate": 100.0}), push)
+    assert run.v[209] == pytest.approx((5.0 * 0.199 - 0.5 * 5.0 * 0.05) / MASS, rel=1e-6)
+    assert run.v[-1] == pytest.approx(5.0 * 0.2 / MASS, rel=1e-6)
+
+
+def test_a_motor_on_a_weak_supply_runs_up_to_its_speed_without_load() -> None:
+    """m dv/dt = F0 (1 - v/v0): an exponential, whatever is commanded beyond; slowing down it has the whole force."""
+    model = AXIS.with_effect("supply_limit", {"F0": 5.0, "v0": 0.2})
+    t, run = DT * np.arange(1000), moved(model, np.full(1000, 50.0))
+    np.testing.assert_allclose(run.v, 0.2 * -np.expm1(-t * 5.0 / (0.2 * MASS)), atol=1e-5)
+    slowed = moved(model, np.full(20, -5.0), v=0.1).v
+    assert (slowed[-1] - slowed[0]) / (19 * DT) == pytest.approx(-5.0 / MASS, rel=1e-6)
+
+
 @pytest.mark.parametrize("n", [0.5, 1.5, 2.5])
 def test_a_coast_under_a_power_of_the_speed(n: float) -> None:
     """v^(1-n) = v0^(1-n) - (1-n) c t / m."""

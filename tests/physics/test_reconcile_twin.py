@@ -39,6 +39,8 @@ CASES: dict[str, dict[str, float]] = {
     "delay": {"delay": 2.4e-3},
     "lag": {"tau": 3e-3},
     "saturation": {"limit": 0.1},
+    "slew_limit": {"rate": 2.0},
+    "supply_limit": {"F0": 0.12, "v0": 15.0},
     "thermal_gain": {"loss": 0.8, "tau": 2.0},
     "elastic": {"f_res": 18.0, "load_fraction": 0.4, "zeta": 0.05},
     "payload": {"J_extra": 6e-4},
@@ -97,6 +99,7 @@ def test_the_sensor_of_the_twin_reads_as_the_model_says() -> None:
         ("encoder_scale", {"gain": 1.02}),
         ("encoder_quantisation", {"factor": 8.0}),
         ("eccentricity", {"amp": 0.01, "phase": 0.5}),
+        ("interpolation_error", {"amp": 0.005, "phase": 1.1, "n": 64.0}),
     ):
         model = model.with_effect(name, values)
     motors, effects, laws = twins({0: model}, [Motor(1.0)], ["axis"], DT)
@@ -104,7 +107,7 @@ def test_the_sensor_of_the_twin_reads_as_the_model_says() -> None:
     for f in FORCE[:900]:
         bank.advance(np.array([f]))
     x = bank.position[0]
-    wanted = 1.02 * (x + 0.01 * np.sin(x + 0.5))
+    wanted = 1.02 * (x + 0.01 * np.sin(x + 0.5) + 0.005 * np.sin(64.0 * x + 1.1))
     assert abs(x) > 0.2
     assert abs(bank.encoder.position[0] - wanted) <= 8e-4
     assert round(bank.encoder.position[0] / 8e-4, 6) % 1 == 0

@@ -11,7 +11,6 @@ import pytest
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.command.selftest import record, write_public
-from sioms.reconcile.conclude import OTHER_LAW
 from sioms.reconcile.effects import library
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.prepare import Options
@@ -106,7 +105,7 @@ def hides(**nameless: dict[str, float]) -> Recording:
 
 
 def test_a_drive_of_a_limited_rate_changes_by_no_more_and_gets_there() -> None:
-    seen = hides(slew={"rate": 2000.0})
+    seen = hides(slew_limit={"rate": 2000.0})
     steps = np.abs(np.diff(seen.force_measured))
     assert np.max(steps) == pytest.approx(2.0, rel=1e-6)
     assert np.max(np.abs(seen.force)) > 40.0 and np.mean(steps > 1.999) > 0.02
@@ -122,7 +121,7 @@ def test_a_weak_supply_gives_nothing_at_its_speed_and_all_at_rest() -> None:
 
 def test_an_encoder_errs_within_its_signal_period_and_nowhere_else() -> None:
     size, n = 2e-6, 50.0
-    plain, wrong = hides(), hides(interpolation={"amp": size, "n": n, "phase": 0.0})
+    plain, wrong = hides(), hides(interpolation_error={"amp": size, "n": n, "phase": 0.0})
     off = (wrong.counts - plain.counts) * 1e-9
     early = slice(0, 30)  # before the controller has acted on it
     place = plain.counts[early] * 1e-9
@@ -135,20 +134,23 @@ def verdict_on(axis: Axis, folder: Path) -> AxisVerdict:
     return analyse(read_data(folder / "axis", model), model, Options(pictures=False))
 
 
-def test_an_encoder_that_errs_within_its_signal_period_is_not_nothing(tmp_path: Path) -> None:
-    """Its waves had passed for noise of the sensor."""
-    axis = draw_axis("waves", "unknown", np.random.default_rng([88002, 0]), "interpolation")
-    order = round(axis.nameless["interpolation"]["n"])
-    verdict = verdict_on(axis, tmp_path)
-    assert verdict.outcome is Outcome.UNEXPLAINED and not verdict.effects
-    assert any(f"comes {order} times in a pitch" in note for note in verdict.notes)
+def test_an_encoder_that_errs_within_its_signal_period_is_named(tmp_path: Path) -> None:
+    """Its waves pass for noise of the sensor."""
+    axis = draw_axis("waves", "single", np.random.default_rng(32), "interpolation_error")
+    truth, verdict = axis.named["interpolation_error"], verdict_on(axis, tmp_path)
+    assert verdict.outcome is Outcome.NAMED and [e.name for e in verdict.effects] == ["interpolation_error"]
+    amp, phase, n = (p.value for p in verdict.effects[0].parameters)
+    assert n == truth["n"] and amp == pytest.approx(truth["amp"], rel=0.02)
+    assert np.cos(phase - truth["phase"]) > 0.999
 
 
-def test_a_limited_rate_of_change_is_named_no_lag(tmp_path: Path) -> None:
-    axis = draw_axis("slewing", "unknown", np.random.default_rng([88002, 3]), "slew")
-    assert axis.current
-    verdict = verdict_on(axis, tmp_path)
-    assert verdict.outcome is Outcome.AMBIGUOUS and (OTHER_LAW,) in verdict.alternatives
+@pytest.mark.parametrize("name", ["slew_limit", "supply_limit"])
+def test_limits_of_the_power_stage_are_named_by_the_measured_force(tmp_path: Path, name: str) -> None:
+    axis = draw_axis("limited", "single", np.random.default_rng(13), name)
+    verdict = verdict_on(replace(axis, current=True), tmp_path)
+    assert verdict.outcome is Outcome.NAMED and [e.name for e in verdict.effects] == [name]
+    for p in verdict.effects[0].parameters:
+        assert p.value == pytest.approx(axis.named[name][p.symbol], rel=0.02)
 
 
 def test_an_eccentric_encoder_is_right_at_every_mark() -> None:

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sioms.reconcile.blocks import better
-from sioms.reconcile.channels import drive_output
+from sioms.reconcile.current import Law
 from sioms.reconcile.effects import library
 from sioms.reconcile.engine.fit import get, put
 from sioms.reconcile.fit import free_parameters
@@ -30,7 +30,8 @@ def model_of(names: list[str], share: float) -> AxisModel:
     for n in names:
         values = {}
         for p in library()[n].parameters:
-            low, high = p.lower * AXIS.scale(p), min(p.upper, 3.0 * abs(p.start) + 0.01) * AXIS.scale(p)
+            most = 3.0 * abs(p.start) + 0.01
+            low, high = max(p.lower, -most) * AXIS.scale(p), min(p.upper, most) * AXIS.scale(p)
             values[p.symbol] = low + share * (high - low) if not p.fixed else p.start
         model = model.with_effect(n, values)
     return model
@@ -60,9 +61,9 @@ def test_free_numbers_go_in_and_come_out(names: list[str], share: float, push: f
 def test_a_drive_neither_makes_nor_loses_impulse(delay: float, limit: float, at: int) -> None:
     force = np.zeros(60)
     force[at] = 1.0
-    out = drive_output(force, delay, 0.0, np.inf, 1e-3)
+    out = Law(delay, 0.0).output(force, 1e-3)
     assert np.sum(out) == pytest.approx(1.0)
-    assert np.max(np.abs(drive_output(force, delay, 0.0, limit, 1e-3))) <= limit
+    assert np.max(np.abs(Law(delay, 0.0, limit=limit).output(force, 1e-3))) <= limit
 
 
 @settings(max_examples=30, deadline=None)

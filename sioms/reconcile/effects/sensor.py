@@ -22,6 +22,20 @@ def _coarse(row: Any, p: Array) -> None:
     row.quantum *= p[0]
 
 
+def _erring(row: Any, p: Array) -> None:
+    row.err_amp, row.err_phase, row.err_n = p
+
+
+#: First guess of an error within the signal period, over that, and how often this comes in a pitch where nothing tells.
+OF_PERIOD, USUAL = 0.02, 64
+
+
+def _waves(seen: Seen) -> Iterator[dict[str, float]]:
+    for n in seen.waves or (USUAL,):
+        for phase in GRID_PHASE:
+            yield {"amp": OF_PERIOD / n * seen.scales["amp"], "phase": float(phase), "n": float(n)}
+
+
 #: First guesses of the eccentricity: phases, and sizes where impacts come to fall differently with each.
 GRID_PHASE = np.linspace(-np.pi, np.pi, 9)[1:]
 SIZES = (1.0, 0.7, 0.4)
@@ -75,6 +89,25 @@ ECCENTRICITY = Effect(
     lookalikes=("gravity", "torque_ripple", "cogging"),
     separate="full turns at several speeds",
 )
+INTERPOLATION_ERROR = Effect(
+    name="interpolation_error",
+    title="encoder that errs within its signal period",
+    channel=Channel.SENSOR,
+    mechanism=Mechanism(
+        _erring,
+        lambda p, pitch: {"encoder_interpolation": {"amplitude": p[0], "pitch": pitch / p[2], "phase": p[1]}},
+    ),
+    trials=Trials(_waves),
+    equation="measured = true + amp sin(n theta + phase)",
+    parameters=(
+        Parameter("amp", "{x}", Ref.PITCH, 0.0, 0.01, 3e-4, "amplitude of the reading error"),
+        Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
+        Parameter("n", "1/pitch", Ref.ONE, 16.0, 4096.0, 64.0, "signal periods in a pitch", fixed=True),
+    ),
+    signature="wave of the position in the position, of one size at all speeds; taken for noise of the sensor",
+    lookalikes=("cogging", "torque_ripple"),
+    separate="slow motion over some signal periods, and full turns at several speeds",
+)
 ENCODER_QUANTISATION = Effect(
     name="encoder_quantisation",
     title="coarser encoder than stated",
@@ -88,4 +121,4 @@ ENCODER_QUANTISATION = Effect(
     separate="slow motion in one direction",
 )
 
-EFFECTS = (ENCODER_SCALE, ECCENTRICITY, ENCODER_QUANTISATION)
+EFFECTS = (ENCODER_SCALE, ECCENTRICITY, INTERPOLATION_ERROR, ENCODER_QUANTISATION)
