@@ -23,6 +23,7 @@ from p4p.server.thread import SharedPV
 
 from sioms.arguments import place, positive
 from sioms.bridges.leases import LEASE_S, Leases
+from sioms.bridges.prompt import Prompt
 from sioms.bridges.putters import Putters
 from sioms.client.workcell import Workcell, is_part
 from sioms.ending import end_well
@@ -71,7 +72,8 @@ def run(args: argparse.Namespace) -> int:
         )
         raise OSError(errno.EINVAL, f"{text} passwords; want a loopback address, as 127.0.0.1, and a tunnel to it")
     putters = Putters(args.user, anybody_stops=args.anybody_stops)
-    bridge = Bridge(args.prefix, putters, Leases() if args.move else None)
+    prompt = Prompt()
+    bridge = Bridge(args.prefix, putters, prompt, Leases(prompt) if args.move else None)
     with serve(bridge.provider, host, port) as server:
         putters.here = (host, int(server.conf()["EPICS_PVAS_SERVER_PORT"]))
         end_well()
@@ -223,13 +225,14 @@ class Bridge:
     Args:
         prefix: what the names of all variables begin with.
         putters: judges who may put.
+        prompt: tells how old a put may be.
         leases: by which clients hold nodes; None: they move nothing.
 
     Concurrency: ``look`` in one thread, ``ask`` in another; puts in any.
     """
 
-    def __init__(self, prefix: str, putters: Putters, leases: Leases | None = None) -> None:
-        self._leases, self._putters = leases, putters
+    def __init__(self, prefix: str, putters: Putters, prompt: Prompt, leases: Leases | None = None) -> None:
+        self._leases, self._putters, self._prompt = leases, putters, prompt
         self.provider = StaticProvider("sioms")
         self._prefix = prefix
         self._shown: dict[str, Shown] = {}
@@ -334,7 +337,8 @@ class Bridge:
 
         def judged(value: float, account: str, peer: str) -> None:
             self._putters.judge(peer, stops=stops)
-            act(value, f"{printable(account, 32)}@{peer}")
+            with self._prompt.word():
+                act(value, f"{printable(account, 32)}@{peer}")
             if self._lock.acquire(timeout=SHOWN_S):
                 try:
                     self._show(node)

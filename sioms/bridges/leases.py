@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
+from sioms.bridges.prompt import Prompt
 from sioms.client.workcell import Workcell
 
 LEASE_S = (0.2, 10.0)
@@ -48,13 +49,14 @@ class Leases:
     """All nodes that are held for clients.
 
     Args:
+        prompt: tells how old what a client has said may be.
         connect: makes a session of a name.
 
     Concurrency: any number of threads.
     """
 
-    def __init__(self, connect: Callable[[str], Any] = lambda name: Workcell(name=name)) -> None:
-        self._connect = connect
+    def __init__(self, prompt: Prompt, connect: Callable[[str], Any] = lambda name: Workcell(name=name)) -> None:
+        self._prompt, self._connect = prompt, connect
         self._lent: dict[str, Lent] = {}
         self._locks: defaultdict[str, threading.Lock] = defaultdict(threading.Lock)
 
@@ -130,7 +132,7 @@ class Leases:
     def _take(self, name: str, who: str, lease_s: float) -> None:
         cell = self._connect(f"sioms epics for {who}")
         try:
-            node = cell.open(name, "rw", lease=lease_s)
+            node = self._prompt.date(cell.open(name, "rw", lease=lease_s))
         except BaseException:
             cell.close()
             raise

@@ -16,7 +16,7 @@ from struct import pack, unpack
 from time import monotonic
 
 from sioms.protocol.messages import MAX_PACKET, MalformedMessage, decode_reply, encode, short_reply, value_of
-from sioms.protocol.verbs import Cancel, CancelOnHandle, Keepalive, Part
+from sioms.protocol.verbs import Cancel, CancelOnHandle, Heard, Keepalive, Part, Passed
 
 from .abandoned import undoing
 from .arguments import checked, seconds
@@ -151,6 +151,8 @@ class Channel:
         keepalive_s: while a thread waits for an answer, it tells the other side this often [s] that it
             lives; 0 = never. The waiting thread itself does, so that a program that hangs is silent.
         fellows: channels that are told together with this one, itself among them; none: this one alone.
+        said_ns: of a bridge, which passes on what others say: tells when what is sent now was said at the earliest [ns,
+            CLOCK_MONOTONIC].
     """
 
     def __init__(
@@ -180,6 +182,7 @@ class Channel:
         self._timeout = 0.0
         self.keepalive_s = 0.0
         self.fellows: Sequence[Channel] = ()
+        self.said_ns: Callable[[], int] | None = None
         self._others_due_s = 0.0
         self._ended: tuple[int, str] | None = None
         self._pid = os.getpid()
@@ -330,6 +333,9 @@ class Channel:
         return number
 
     def _put(self, packet: bytes) -> None:
+        if self.said_ns is not None:
+            at_ns = self.said_ns()
+            packet = Heard(at_ns).packed() if packet is KEEPALIVE else Passed(at_ns, packet).packed()
         if self.carrier is None:
             self._sock.send(packet)
         else:

@@ -416,8 +416,8 @@ class Keepalive(Message, on=ON_HANDLE, verb=HandleVerb.KEEPALIVE, notice=True, q
 
 
 class Heard(Message, on=ON_HANDLE, verb=HandleVerb.HEARD, notice=True, query=True):
-    """Renew the lease from an instant on [ns, CLOCK_MONOTONIC]; from then on nothing else does. A gateway says so: what
-    it passes on may be old.
+    """Renew the lease from an instant on [ns, CLOCK_MONOTONIC]; from then on nothing else does. A gateway or a bridge
+    says so: what it passes on may be old.
     """
 
     at_ns: Integer

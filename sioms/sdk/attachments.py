@@ -175,25 +175,27 @@ class Attachments:
             if not packet:
                 self.drop(handle)
                 return
-            number, message, whole = self._taken(handle, packet)
-            latest_ns = handle.heard_ns if handle.passed_on else NEVER_NS
-            came = Came(UNKNOWN if handle.is_in_doubt else resets, timestamp_ns, latest_ns)
+            number, message, whole, latest_ns = self._taken(handle, packet)
+            is_in_doubt = handle.is_in_doubt or latest_ns < handle.reset_ns
+            came = Came(UNKNOWN if is_in_doubt else resets, timestamp_ns, latest_ns)
             handle.took(len(packet))
             self._serve(handle, number, message, whole, came)
 
         self._guarded(handle, serve)
 
-    def _taken(self, handle: Handle, packet: bytes) -> tuple[int, Message, bytes]:
-        """Take a packet, and what a gateway says of it; return its number, message, and the packet of the client."""
+    def _taken(self, handle: Handle, packet: bytes) -> tuple[int, Message, bytes, int]:
+        """Take a packet, and what a gateway says of it; return its number, message, the packet of the client, and the
+        instant than which it is taken for no younger [ns, CLOCK_MONOTONIC].
+        """
         number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
         if not isinstance(message, verbs.Passed):
-            return number, message, packet
-        self.heard(handle, min(message.at_ns, handle.came_ns))
-        packet = message.packet
+            return number, message, packet, handle.heard_ns if handle.passed_on else NEVER_NS
+        at_ns, packet = message
+        self.heard(handle, min(at_ns, handle.came_ns))
         number, message = verbs.take(packet, verbs.ON_HANDLE, pending=handle.waits)
         if isinstance(message, verbs.Passed):
             raise MalformedMessage("a packet that is passed on twice")
-        return number, message, packet
+        return number, message, packet, at_ns
 
     def _guarded(self, handle: Handle, serve: Callable[[], None]) -> None:
         """Serve a client; what goes wrong ends its handle."""

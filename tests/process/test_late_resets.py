@@ -6,11 +6,14 @@ import errno
 import os
 import socket
 import struct
+import time
 
 import pytest
 from daemon_rig import Daemon, Waiting, put_in_fault, raises, wait_for
 
 import sioms
+from sioms.bridges.leases import Leases
+from sioms.bridges.prompt import LATE_NS, SETTLE_NS, Prompt
 from sioms.client.channel import Call
 from sioms.client.stopping import emergency_stop
 from sioms.protocol.flags import PROTOCOL_VERSION, AxisStatus
@@ -126,3 +129,24 @@ def _sent(cell: sioms.Workcell) -> bool:
     from termios import TIOCOUTQ
 
     return struct.unpack("i", ioctl(cell._channel._sock.fileno(), TIOCOUTQ, bytes(4)))[0] > 0
+
+
+def test_a_bridge_that_was_held_up_passes_on_no_put_of_before_a_reset(daemon: Daemon, cell: sioms.Workcell) -> None:
+    now_ns = [time.monotonic_ns()]
+    prompt = Prompt(lambda: now_ns[0], beats=False)
+    leases = Leases(prompt, lambda name: daemon.cell(name))
+    leases.put("mod0", "eva", 5.0)
+    with cell.open("mod0.xaxis.readonly") as seen:
+        cell.emergency_stop()
+        cell.reset()
+        now_ns[0] = time.monotonic_ns()  # it goes on only now
+        with prompt.word(), raises(errno.ECANCELED, "sent before the last reset"):
+            leases.move("mod0", "eva", "xaxis", 0.05)
+        assert not seen.read().in_motion[0]
+        for _ in range(2 * SETTLE_NS // LATE_NS):
+            now_ns[0] += LATE_NS
+            prompt.beat()
+        with prompt.word():
+            leases.move("mod0", "eva", "xaxis", 0.05)
+        wait_for(lambda: seen.read().in_motion[0], "motion")
+    leases.put("mod0", "eva", 0.0)

@@ -231,6 +231,36 @@ def test_a_mount_that_is_killed_halts_and_another_takes_its_place(daemon: Daemon
             assert second.wait(20) == 0
 
 
+def test_what_was_written_before_a_reset_is_not_carried_out_by_a_mount_that_is_held_up(
+    daemon: Daemon, axis: sioms.AxisNode
+) -> None:
+    """It stands still for less than its lease, in which somebody writes, and somebody else stops and resets all."""
+    with Mount(daemon.socket, "--lease", "5") as mount, daemon.cell() as cell:
+        fd = os.open(mount.folder / "mod0/xaxis", os.O_WRONLY | os.O_NONBLOCK)
+        try:
+            os.write(fd, b"velocity=0.2\n")
+            wait_for(lambda: axis.read().commanded_velocity[0] == pytest.approx(0.2), "motion")
+            for held_s in (0.03, 0.06):
+                time.sleep(0.3)  # nothing waits still from the last time
+                os.kill(mount.process.pid, signal.SIGSTOP)
+                late = Waiting(lambda: os.write(fd, b"velocity=0.2\n"))
+                time.sleep(held_s)
+                cell.emergency_stop()
+                cell.reset()
+                os.kill(mount.process.pid, signal.SIGCONT)
+                assert late.errno() == errno.ECANCELED, (held_s, (mount.folder / ".log").read_text())
+                wait_for(lambda: axis.read().commanded_velocity[0] == 0.0, "rest")
+                assert "sent before the last reset" in (mount.folder / ".log").read_text()
+            time.sleep(0.3)
+            os.write(fd, b"velocity=0.2\n")
+            wait_for(lambda: axis.read().commanded_velocity[0] == pytest.approx(0.2), "motion")
+            cell.emergency_stop()
+            cell.reset()
+            os.write(fd, b"velocity=0.2\n")  # at once, as it has not been held up
+        finally:
+            os.close(fd)
+
+
 def test_a_mount_outlives_its_daemon(start_daemon: Callable[..., Daemon]) -> None:
     """What is open is lost, and says so; what is opened is of the daemon that is there; nothing waits for ever."""
     daemon = start_daemon()

@@ -4,10 +4,11 @@ they share: a request that the reset has answered stops nobody after it, and one
 
 from __future__ import annotations
 
+import functools
 import itertools
 import os
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -22,6 +23,10 @@ from sioms.timestamps import Timestamps
 
 OWNER, STOPPER, RESETTER, LATER = 0, 1, 0, 2
 AXIS = 0
+
+
+class Died(BaseException):
+    """The daemon has been killed."""
 
 
 class Watched:
@@ -70,9 +75,15 @@ def interrupted(latch: Latch, place: int, act: Callable[[], object]) -> Iterator
         yield left
 
 
-def meetings(before: Sequence[Action], inside: str, act: Callable[[Cell], object]) -> Iterator[tuple[Cell, int, str]]:
+def meetings(
+    before: Sequence[Action], inside: str, act: Callable[[Cell], object], *, dies: bool = False
+) -> Iterator[tuple[Cell, int, str]]:
     """Have somebody act before each access within a reset by the daemon or a look of the driver; yield, each time, the
     cell as it is then, the place, and what the reset was answered.
+
+    Args:
+        before, inside, act: what has happened before, what is interrupted, and by what.
+        dies: the daemon dies when the reset stands in the latch.
     """
     for place in itertools.count():
         with cells() as make, pytest.MonkeyPatch.context() as patch:
@@ -86,13 +97,21 @@ def meetings(before: Sequence[Action], inside: str, act: Callable[[Cell], object
             sent_ns = CLOCK()
             patch.setattr(Timestamps, "monotonic_ns", lambda *_, sent_ns=sent_ns: sent_ns)
             mine = cell.server.cell.shared.latch if inside == "reset" else cell._process(AXIS).runtime.latch
-            with interrupted(mine, place, lambda cell=cell: act(cell)) as left:  # type: ignore[misc]
+            if dies:
+                patch.setattr(mine, "reset", functools.partial(_die_after, mine.reset))
+            answer = ""
+            with interrupted(mine, place, functools.partial(act, cell)) as left, suppress(Died):
                 answer = cell.reset(RESETTER) if inside == "reset" else cell.tick(AXIS) or ""
             patch.undo()
             if left[0] >= 0:
                 assert place > 3
                 return
             yield cell, place, answer
+
+
+def _die_after(call: Callable[..., object], *arguments: object) -> None:
+    call(*arguments)
+    raise Died
 
 
 @pytest.mark.parametrize("inside", ["tick", "reset"])
@@ -122,7 +141,8 @@ def test_a_stop_that_is_younger_than_a_reset_holds(by: str, looks: bool, dies: b
         if looks:
             cell.take(("tick", AXIS))
 
-    for cell, place, answer in meetings([("request_stop", STOPPER), ("beat",), ("tick", 1)], "reset", act):
+    before: list[Action] = [("request_stop", STOPPER), ("beat",), ("tick", 1)]
+    for cell, place, answer in meetings(before, "reset", act, dies=dies):
         if dies:
             cell.take(("crash",))
             for device in (0, 1):

@@ -27,6 +27,20 @@ KNOWN = Path(__file__).with_name("versions.txt")
 """Each version, and the fingerprint of what was told under it."""
 
 
+OWN = {
+    "PROTOCOL_VERSION",
+    "TYPE_CHECKING",
+    "EMSGSIZE",
+    "SOMEBODY",
+    "_GOOD",
+    "_LOOKS",
+    "_ORDERED",
+    "_SHORT",
+    "_SHORT_HEAD",
+}
+"""Values that each process has for itself."""
+
+
 def described(value: Any) -> Iterator[str]:
     """Tell of a value of a module what both ends have to agree on."""
     match value:
@@ -52,7 +66,7 @@ def facts() -> list[str]:
         f"{module.__name__}.{name}: {line}"
         for module in modules
         for name, value in sorted(vars(module).items())
-        if name not in ("PROTOCOL_VERSION", "TYPE_CHECKING") and not name.startswith("__")
+        if name not in OWN and not name.startswith("__")
         for line in described(value)
     ]
 

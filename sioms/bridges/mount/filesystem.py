@@ -26,6 +26,7 @@ from sioms.protocol.socketpath import cell_address
 from sioms.protocol.stopfile import open_stop_request
 from sioms.protocol.text import printable
 
+from ..prompt import Prompt
 from .callers import Caller, acting_as, caller
 from .opened import NodeFile, Patience
 from .sessions import Sessions
@@ -49,7 +50,8 @@ def served(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def operation(self: Nodes, path: str, *arguments: Any) -> Any:
         try:
-            return function(self, path, *arguments)
+            with self.prompt.word():
+                return function(self, path, *arguments)
         except OSError as error:
             # Shells and completion look for files all the time, and who opens a file asks whether it is a terminal.
             is_look = function.__name__ == "getattr" and error.errno == errno.ENOENT
@@ -89,6 +91,7 @@ class Nodes(mfusepy.Operations):  # type: ignore[misc]
         """Begin, in the process that serves."""
         self._keeper = Keeper(self._open_files, self._lease_s)
         self._notifier = Notifier(_fuse)
+        self.prompt = Prompt()
         self._ready()
 
     def _open_files(self) -> Iterator[NodeFile]:
@@ -202,6 +205,8 @@ class Nodes(mfusepy.Operations):  # type: ignore[misc]
             raise
 
     def _made(self, cell: Any, node: Any, who: Caller, place: NodePlace, *, nonblock: bool, owned: bool) -> NodeFile:
+        if owned:
+            self.prompt.date(node)
         return NodeFile(cell, node, who, self._patience, binary=place.binary, nonblock=nonblock, owned=owned)
 
     def _new(self, file: NodeFile | bytes | None) -> int:

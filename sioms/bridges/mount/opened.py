@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
+from contextvars import copy_context
 from typing import Any
 
 from sioms.client.workcell import Workcell
@@ -67,7 +68,7 @@ class Patience:
             OSError: EINTR, the caller was interrupted; EAGAIN, too many wait already; what it raises itself.
         """
         with self._turn():
-            done = self._pool.submit(what)
+            done = self._pool.submit(copy_context().run, what)
             while not wait([done], LOOK_S).done:
                 if self._interrupted():
                     end()

@@ -20,6 +20,7 @@ pytest.importorskip("p4p", reason="needs the extra epics")
 from p4p.client.thread import Context, RemoteError
 
 from sioms.bridges import epics
+from sioms.bridges.prompt import Prompt
 from sioms.bridges.putters import Putters
 from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
@@ -97,7 +98,7 @@ def cell(monkeypatch: pytest.MonkeyPatch) -> Cell:
 
 @pytest.fixture
 def bridge(cell: Cell) -> epics.Bridge:
-    made = epics.Bridge("lab:", Putters())
+    made = epics.Bridge("lab:", Putters(), Prompt(beats=False))
     look(made)
     return made
 
@@ -217,7 +218,7 @@ def test_a_put_that_is_answered_shows(cell: Cell) -> None:
     """A script waits for .DMOV behind its put: it must not find the motion before."""
     cell.node.moving = 0
     held = SimpleNamespace(move=lambda *_: setattr(cell.node, "moving", 1), shown=lambda _: (0.5, 0, ""), sweep=bool)
-    bridge = epics.Bridge("", Putters(), held)  # type: ignore[arg-type]
+    bridge = epics.Bridge("", Putters(), Prompt(beats=False), held)  # type: ignore[arg-type]
     look(bridge)
     with serving(bridge) as client:
         assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 1
@@ -234,7 +235,7 @@ def mover() -> tuple[epics.Bridge, list[Any]]:
         put=lambda *words: calls.append(words), move=lambda *words: calls.append(words), shown=lambda _: (0.5, 0, "x"),
         sweep=lambda: None,
     )  # fmt: skip
-    return epics.Bridge("", Putters(), held), calls  # type: ignore[arg-type]
+    return epics.Bridge("", Putters(), Prompt(beats=False), held), calls  # type: ignore[arg-type]
 
 
 def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from sioms.bridges import leases
+
+UNDATED: Any = SimpleNamespace(date=lambda node: node)
 
 
 class Node:
@@ -38,7 +41,7 @@ class Node:
 def test_a_client_moves_a_node_for_as_long_as_it_renews_its_lease(monkeypatch: pytest.MonkeyPatch) -> None:
     now_s, node, names = [100.0], Node(), list[str]()
     monkeypatch.setattr(leases, "monotonic", lambda: now_s[0])
-    held = leases.Leases(lambda name: names.append(name) or node)  # type: ignore[func-returns-value]
+    held = leases.Leases(UNDATED, lambda name: names.append(name) or node)  # type: ignore[func-returns-value]
 
     with pytest.raises(OSError, match="mod0 is not held by you"):
         held.move("mod0", "ann", "xaxis", 0.1)

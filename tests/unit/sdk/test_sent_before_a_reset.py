@@ -642,5 +642,10 @@ def test_so_it_is_where_a_gateway_says_it_in_the_packet_that_it_passes_on(axes: 
     said_ns = CLOCK()
     owner.jog()
     assert owner.served() == [None, errno.ECANCELED, None]
+    _stop_and_reset(axes, [0])
+    axes.runtime.heed()
+    axes.runtime.clients.heard(handle, CLOCK())  # its bridge is there, and its client's word is as old as it was
+    owner.jog()
+    assert owner.served() == [None, errno.ECANCELED, None, errno.ECANCELED]
     with pytest.raises(MalformedMessage, match="twice"):
         axes.runtime.clients._taken(handle, Passed(said_ns, Passed(said_ns, b"").packed()).packed())

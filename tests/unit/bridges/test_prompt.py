@@ -1,0 +1,37 @@
+"""What a bridge serves has come just now, but for what it may have kept waiting."""
+
+from __future__ import annotations
+
+import time
+
+from sioms.bridges.prompt import LATE_NS, SETTLE_NS, Prompt
+
+
+def test_a_word_is_as_old_as_the_last_beat_before_all_was_held_up() -> None:
+    now = [10**12]
+    prompt = Prompt(lambda: now[0], beats=False)
+
+    def go_on(ns: int, *, beats: bool = True) -> int:
+        now[0] += ns
+        if beats:
+            prompt.beat()
+        return prompt.came_ns()
+
+    went_ns = now[0] + SETTLE_NS
+    while now[0] < went_ns:
+        assert go_on(LATE_NS) <= now[0]
+    assert go_on(LATE_NS) == now[0], "in time, as long ago as it can be told"
+    held_ns = now[0]
+    assert go_on(LATE_NS + 1, beats=False) == held_ns, "also before the beat that is late"
+    assert go_on(LATE_NS) == held_ns, "what came meanwhile may have its turn now"
+    assert go_on(3 * LATE_NS) == held_ns, "held up again, it may wait still"
+    for _ in range(SETTLE_NS // LATE_NS - 1):
+        assert go_on(LATE_NS) == held_ns
+    assert go_on(LATE_NS) == now[0]
+
+
+def test_it_beats_by_itself() -> None:
+    prompt = Prompt()
+    time.sleep(0.5)
+    before_ns = time.monotonic_ns()
+    assert before_ns - prompt._seen[0] < before_ns - prompt._seen[2], "it has beaten since it was made"
