@@ -22,8 +22,8 @@ SAME, EVEN = 0.98, 0.1
 POLLED = 0.5
 #: Rows that tell what a column is.
 FEWEST = 8
-#: An index mark passes in at most this share of the rows.
-RARE = 0.1
+#: An index mark passes in at most this share of the rows; what changes in fewer than the second is set, not measured.
+RARE, SELDOM = 0.1, 0.01
 NEEDED = ("position", "force")
 #: How the scale of a voltage or a current is found.
 ELECTRIC = {
@@ -111,6 +111,10 @@ def guessed(table: Table) -> list[Guess]:
                 unit = table.units.get(head, named(head)[1])
                 out[head] = Guess(head, unit, quantity, "by its head")
                 taken[quantity] = head
+    if "position" not in taken and (found := _changes_of(table, [h for h in table.columns if h not in out])):
+        head, speed = found
+        out[head] = Guess(head, table.units.get(head, named(head)[1]), "position", f"{speed!r} goes with its changes")
+        taken["position"] = head
     for head, values in table.columns.items():
         says = _by_head(head, table)
         if head not in out and says in taken:
@@ -180,9 +184,21 @@ def _by_numbers(values: Array, table: Table, taken: Mapping[str, str]) -> tuple[
         beside = {"position": "command", "force": "force_measured"}[known]
         if beside not in taken and _alike(values, other) > SAME:
             return beside, f"it goes with {taken[known]}"
+    if np.mean(steps != 0.0) < SELDOM:
+        return None, "it changes in steps, as what somebody sets"
     if "position" not in taken and np.std(np.diff(values, 3)) < 0.05 * np.std(values):
         return "position", "it changes smoothly"
     return None, "nothing tells what it is"
+
+
+def _changes_of(table: Table, heads: list[str]) -> tuple[str, str] | None:
+    """Return a column and one that goes with its changes, the first with those of no other; None without such."""
+    columns = {h: c for h in heads if len(c := table.columns[h]) >= FEWEST and np.all(np.isfinite(c))}
+    pairs = [
+        (x, v) for x in columns for v in columns if x != v and abs(_alike(columns[v][1:], np.diff(columns[x]))) > SAME
+    ]
+    speeds = {v for _, v in pairs}
+    return next((pair for pair in pairs if pair[0] not in speeds), None)
 
 
 def _alike(a: Array, b: Array) -> float:

@@ -71,6 +71,14 @@ def test_columns_without_heads_are_told_by_their_numbers() -> None:
     assert list(found.values()) == ["time", "position", "velocity", "command", "index", None, None]
 
 
+def test_a_speed_beside_it_tells_a_position_and_steps_tell_none() -> None:
+    set_by_hand = np.repeat([0.2, -0.3, 0.1, 0.4], 500)
+    turning = 30.0 * T + X  # it runs on and on
+    columns = (set_by_hand, T, turning, np.gradient(turning, T), np.gradient(np.gradient(turning, T), T))
+    found = quantities({f"d(:,{i})": a for i, a in enumerate(columns, 1)})
+    assert list(found.values()) == [None, "time", "position", "velocity", None]
+
+
 def test_a_unit_says_more_than_a_head() -> None:
     assert quantities({"t": T, "y": X, "i": U}, {"i": "lbf", "y": "in"})["y"] == "position"
     assert quantities({"v": X}, {"v": "rpm"}) == {"v": "velocity"}
