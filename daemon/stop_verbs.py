@@ -107,11 +107,8 @@ class StopVerbs:
                 raise Refused(errno.EAGAIN, f"reset: a stop has just been requested ({source}); reset again")
             sent_ns = self._sent_ns(session, said_ns)
             if self._stops.stopped_since(sent_ns, session.number):
-                by = f" ({source})" if (source := self._cell.shared.latch.source) else ""
-                raise Refused(
-                    errno.EAGAIN,
-                    f"reset: the workcell, or a node, stopped{by} after this was sent; see why, and reset again",
-                )
+                by = self._stops.stopped_by()
+                raise Refused(errno.EAGAIN, f"reset: stopped after this was sent ({by}); see why, and reset again")
             self._refuse_unseen("reset", sent_ns, devices)
             self._stops.reset_workcell(str(session), sent_ns, session.number)
             return
@@ -131,7 +128,8 @@ class StopVerbs:
         if latch.stopped_ns:
             raise Refused(errno.EPERM, f"reset {name}: the whole workcell is stopped ({latch.source}); reset that")
         if self._stops.stopped_since(sent_ns, session.number, node):
-            raise Refused(errno.EAGAIN, f"reset {name}: stopped after this was sent; see why, and reset again")
+            by = self._stops.stopped_by(node)
+            raise Refused(errno.EAGAIN, f"reset {name}: stopped after this was sent ({by}); see why, and reset again")
         try:
             self._stops.reset_node(node, str(session), sent_ns, session.number)
         except OSError as error:

@@ -161,6 +161,15 @@ class Stops:
         latest_ns = asked.latest_of_any_ns(by) if node is None else asked.latest_ns(*_masks(*self._parts(node)), by)
         return latest_ns > instant_ns
 
+    def stopped_by(self, node: Node | None = None) -> str:
+        """Return who has stopped a node, or the workcell or any of its nodes, in words."""
+        if node is None:
+            nodes = [f"{name}: {by}" for name, by in self._shared.record.state.nodes()]
+            return self._shared.latch.source if self._shared.latch.stopped_ns else ", ".join(nodes[-2:])
+        block, parts = self._parts(node)
+        stopped = self._shared.record.state.parts
+        return next((stopped[(*block, *part)][0] for part in parts if (*block, *part) in stopped), "it has been reset")
+
     def reset_node(self, node: Node, who: str, sent_ns: int, by: int) -> None:
         """Clear the stop and the faults of a node.
 

@@ -39,7 +39,7 @@ def test_a_reset_that_the_daemon_serves_late_leaves_a_later_stop_on_a_handle(
             resetting = Waiting(lambda: cell.reset(name), None)
             wait_for(lambda: _sent(cell), "the reset is sent")
             seen.emergency_stop()
-        assert resetting.errno() == errno.EAGAIN
+        assert resetting.errno() == errno.EAGAIN and ") stopper on mod0.xaxis" in str(resetting.error)
         assert _latched(seen) and _latched(beside)
         seen_again = daemon.device("mod0")
         os.kill(seen_again["pid"], 9)
