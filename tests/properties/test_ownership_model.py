@@ -46,6 +46,7 @@ SCHEDULES = [
     "open 0 0, hear 0, move 0 0, die 0 0, see_death 0 socket",
     "open 0 1, hear 1, move 0 1, stop 1, tick 1",
     "open 0 0, hear 0, move 0 0, lapse 0",
+    "open 0 0, hear 0, move 0 0, stop 1, reset 1, tick 0",
     "request_stop 0, tick 0, reset 1, tick 1, request_stop 0, reset 1",
     "request_stop 0, beat, reset 1, crash, hear 0, leave 0, hear 1, leave 1, boot",
     "open 0 0, stop_node 1 0, tick 0, hear 0, move 0 0",
