@@ -182,8 +182,12 @@ class Around:
 
     def missed(self, x: float, y: float, psi: float) -> None:
         """Take note of a line along which a finger met nothing."""
-        self._tried.append((x, y, psi))
+        self.tried(x, y, psi)
         self._aside *= 0.5
+
+    def tried(self, x: float, y: float, psi: float) -> None:
+        """Take note of a line that is not to be tried again."""
+        self._tried.append((x, y, psi))
 
     def add(self, touches: Sequence[Touch], x: float, y: float, psi: float) -> None:
         """Add what fingers 1 and 2 felt that came along a line."""
@@ -198,7 +202,7 @@ class Around:
                     self._wrong[i] = 0.8 * self._wrong[i] + min(off, _WRONG_RAD)
         for touch in touches:  # also of the first of them, if that has moved the object
             self._touches = [old for old in self._touches if not _contradict(old, touch)] + [touch]
-        self._tried.append((x, y, psi))
+        self.tried(x, y, psi)
         self.smooth = self._wrong[1] < self._wrong[0]
 
     def _sides_outline(self) -> tuple[Array, float]:

@@ -37,9 +37,11 @@ class Feeling(Motions):
         """
         before, self.state = self.state, State.FEEL
         x, y, direction, d, *_ = self._goal
-        around, begun = Around(), self.taps
+        around, begun = self._around or Around(), self.taps
         first = None if known else Parallel(x, y, direction, d - 2.0 * FINGER_M, math.inf)
-        if known:
+        if self._around is not None:
+            around.tried(x, y, direction)
+        elif known:  # of those that were squeezed later, corners tell less than what it knows
             around.add(known, x, y, direction)
         opened = max(self._goal[3], self._free_m)
         yield from self._move((x, y, direction, opened, *self._goal[4:]))
@@ -61,9 +63,17 @@ class Feeling(Motions):
                 around, best, found = Around(), _NEARLY_RAD, None
                 opened = min(opened + 2.0 * self.manner.clearance_m, self.manner.opening[1] - 1e-3)
             touches: list[Touch] = []
+            pushed = None
             for index in (0, 1):
-                touch = yield from self._tap(index, 0.5 * one.apart_m + FINGER_M)
+                touch, pushed = yield from self._tap(index, 0.5 * one.apart_m + FINGER_M)
                 touches += [touch] if touch is not None else []
+                if pushed is not None:
+                    break
+            if pushed is not None:  # it is beside that finger, and may lie otherwise now
+                self.say(f"finger {index + 1} pushes what its array does not feel, at {_place(pushed)}: felt anew")
+                around, best, found = Around(), _NEARLY_RAD, None
+                first = Parallel(*pushed, one.direction + 0.5 * math.pi, opened - 2.0 * FINGER_M, math.inf)
+                continue
             if len(touches) < 2:
                 around.missed(one.x, one.y, one.direction)
             elif (off := _held_by(touches)[0]) < best:
@@ -81,8 +91,11 @@ class Feeling(Motions):
         """Return the narrowest object that the hand closes on [m]."""
         return self.manner.opening[0] - 2.0 * FINGER_M
 
-    def _tap(self, index: int, near_m: float) -> Generator[Setpoint, Reading, Touch | None]:
-        """Touch the object with one finger and leave it again; return what it felt, None where there is nothing.
+    def _tap(
+        self, index: int, near_m: float
+    ) -> Generator[Setpoint, Reading, tuple[Touch | None, tuple[float, float] | None]]:
+        """Touch the object with one finger and leave it again; return what it felt, None where there is nothing, and
+        where the finger was when it did not go on and felt nothing.
 
         Args:
             index: of the finger.
@@ -94,10 +107,11 @@ class Feeling(Motions):
         manner, side = self.manner, 0.5 - index
         u, v = math.cos(self._goal[2]), math.sin(self._goal[2])
         start, way, force = list(self._goal), 0.0, 0.0
-        rested_s, met = 0.0, False
+        rested_s, unfelt_s, beside_s, met = 0.0, 0.0, 0.0, False
         most, latest_s = 0.5 * start[3] + FINGER_M, self.now.time_s + manner.close_s
         touch: Touch | None = None
-        while way < most:
+        pushed: tuple[float, float] | None = None
+        while way < most and pushed is None:
             finger, before_s = self.now.fingers[index], self.now.time_s
             if before_s > latest_s:
                 raise Failed(
@@ -108,14 +122,22 @@ class Feeling(Motions):
             far = 0.5 * start[3] - way > near_m + _NEAR_M
             rate = manner.moving if far else _GENTLE * manner.closing
             along: Six = (side * rate * u, side * rate * v, 0.0, -rate, 0.0, 0.0)
-            met = met or bool(finger.touched)
+            met = bool(finger.touched) or (met and unfelt_s < _UNFELT_S)
             if met:
                 self._yield()
                 rate = 0.0 if rested_s > 0.0 or force > manner.tap_n else _CREEP * manner.closing
                 along = self._by_link(index, rate)
             yield from self._follow(along, 0.0)
             gone_s = self.now.time_s - before_s
+            told = self.now.fingers[index]
+            unfelt_s = 0.0 if told.touched else unfelt_s + gone_s
+            beside_s = max(beside_s + gone_s * (1 if _BESIDE in told.doubt else -1 if told.touched else 0), 0.0)
+            if beside_s > _BESIDE_S:  # pressed on, it would push the object away
+                break
             way += rate * gone_s
+            at = self._centre(index, self.now.joints)
+            if not met and math.dist(at, self._centre(index, self.hand.inverse(self._goal))) > _PUSHES_M:
+                pushed = at
             force += min(gone_s / _FILTER_S, 1.0) * (self.now.fingers[index].force - force)
             rested_s = rested_s + gone_s if rate == 0.0 else 0.0
             if rested_s > _RESTED_S:
@@ -128,7 +150,13 @@ class Feeling(Motions):
             rate = min(manner.moving, 10.0 * left)
             yield from self._follow((-side * rate * u, -side * rate * v, 0.0, rate, 0.0, 0.0), LETTING_GO_N)
         self._goal = start
-        return touch
+        return touch, pushed
+
+    def _centre(self, index: int, joints: Sequence[float]) -> tuple[float, float]:
+        """Return the centre of a finger."""
+        x, y, th = joints[3 * index : 3 * index + 3]
+        length = (self.hand.link1_m, self.hand.link2_m)[index]
+        return x + length * math.cos(th), y + length * math.sin(th)
 
     def _by_link(self, index: int, speed: float) -> Six:
         """Return rates of the coordinates at which one link alone turns its finger towards the other [m/s].
@@ -161,7 +189,7 @@ class Feeling(Motions):
         points: list[tuple[float, float]] = []
         normals: list[float] = []
         doubts: list[str] = []
-        length, frames = (self.hand.link1_m, self.hand.link2_m)[index], _FRAMES * self.manner.frames
+        frames = _FRAMES * self.manner.frames
         for _ in range(frames):
             self._yield()
             yield from self._follow((0.0,) * 6, 0.0)
@@ -171,12 +199,9 @@ class Feeling(Motions):
             if misleading := _MISLEADS.intersection(finger.doubt.split("|")):
                 doubts.append(_BESIDE if _BESIDE in misleading else min(misleading))
                 continue
-            x, y, th = self.now.joints[3 * index : 3 * index + 3]
-            normal = th + finger.phi
-            points.append((
-                x + length * math.cos(th) + FINGER_M * math.cos(normal),
-                y + length * math.sin(th) + FINGER_M * math.sin(normal),
-            ))  # fmt: skip
+            x, y = self._centre(index, self.now.joints)
+            normal = self.now.joints[3 * index + 2] + finger.phi
+            points.append((x + FINGER_M * math.cos(normal), y + FINGER_M * math.sin(normal)))
             normals.append(normal)
         count = len(normals)
         if doubts.count(_BESIDE) > frames // 2:
@@ -196,13 +221,19 @@ class Feeling(Motions):
 
 _MIDDLE_RAD = math.radians(74.0)  # of an array
 FITS_RAD, _NEARLY_RAD = math.radians(0.5), math.radians(4.0)
+_PUSHES_M = 4e-3
+"""How far a finger that feels nothing stays behind what is wanted of it: some 0.06 N on its soft link; free ones 2 mm."""
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
 _FRAMES = 2  # times those of a grasp, for lighter touches
 _CREEP = 0.3  # of the closing speed, once it has met it
-_FILTER_S, _RESTED_S = 0.03, 0.1
-_BESIDE = Quality.OUT_OF_ARC.name
+_FILTER_S, _RESTED_S, _UNFELT_S = 0.03, 0.1, 0.5
+_BESIDE, _BESIDE_S = "OUT_OF_ARC", 0.02
 _MISLEADS = {name for name, flag in Quality.__members__.items() if flag in DOUBT & ~Quality.IMPRECISE}
 """What a touch must not be; one so light is never precise."""
+
+
+def _place(at: tuple[float, float]) -> str:
+    return f"{1e3 * at[0]:.0f}, {1e3 * at[1]:.0f} mm"
 
 
 def _held_by(touches: Sequence[Touch]) -> tuple[float, tuple[float, float, float]]:

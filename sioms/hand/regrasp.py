@@ -13,6 +13,7 @@ from sioms.hand.kinematics import Six, wrap
 
 NEUTRAL = 0.5 * math.pi  # finger angle at which the link is across the line of contacts and its soft axis takes force
 _FLAT = 1e-3  # 1/m: flatter than this is a side
+_BESIDE, _CORNER_M = 2.0, 1.5e-3  # how far beside, in friction angles, and the radius of a corner
 
 
 def disk_radii(grasp: Grasp) -> tuple[float, float]:
@@ -67,3 +68,24 @@ def regrasp_convex(grasp: Grasp, curvatures: tuple[float, float], finger_m: floa
     fx, fy, gx, gy = x1 - ux / bend1, y1 - uy / bend1, x2 + ux / bend2, y2 + uy / bend2
     apart = (gx - fx) * ux + (gy - fy) * uy
     return 0.5 * (fx + gx), 0.5 * (fy + gy), psi, apart + 2.0 * finger_m, NEUTRAL, NEUTRAL
+
+
+def beside(grasp: Grasp, curvatures: tuple[float, float], finger_m: float = FINGER_M) -> Six:
+    """Return hand coordinates of the parallel grasp of two arcs, no farther away than its friction angles tell.
+
+    For a grasp that touches have shown to be parallel and that is not when it is squeezed: a finger on a corner feels
+    the side beside it. The arcs are those of there; where they lead far away they are not true.
+
+    Args:
+        grasp: the present one.
+        curvatures: as of `regrasp_convex`.
+        finger_m: rb.
+    """
+    x, y, psi, d, _, _ = regrasp_convex(grasp, curvatures, finger_m)
+    x0, y0 = (0.5 * (a + b) for a, b in zip(grasp.contact1, grasp.contact2, strict=True))
+    s, c = math.sin(grasp.direction), math.cos(grasp.direction)
+    shift, turn = (y - y0) * c - (x - x0) * s, wrap(psi - grasp.direction)
+    most = _BESIDE * grasp.quality
+    share = min(1.0, most * (finger_m + _CORNER_M) / max(abs(shift), 1e-9), most / max(abs(turn), 1e-9))
+    psi = wrap(grasp.direction + share * turn)
+    return x0 - share * shift * s, y0 + share * shift * c, psi, d, NEUTRAL, NEUTRAL

@@ -22,7 +22,7 @@ from sioms.hand.contacts import FINGER_M, Grasp, Likeness, classify, friction_an
 from sioms.hand.feeling import Feeling
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.motions import STILL
-from sioms.hand.regrasp import NEUTRAL, disk_radii, regrasp_disk, regrasp_rectangle
+from sioms.hand.regrasp import NEUTRAL, beside, disk_radii, regrasp_disk, regrasp_rectangle
 from sioms.hand.rolling import correcting_law, friction_angle_rates, nearest_law
 from sioms.hand.shape import Touch, expected
 from sioms.hand.touch import Failed, Fault, Manner, Reading, Sensed, Setpoint, State
@@ -195,9 +195,11 @@ class Skills(Feeling):
         self._past.append(found)
         self.regrasps += 1
         self.say(f"{found.likeness.value}-like, {_degrees(found.grasp)}: regrasp")
-        target, sure = self._planned(found)
         felt: Six | None = None
-        sure = sure or (self._around is not None and found.grasp.quality < _BESIDE_RAD)
+        if self._around is not None and found.grasp.quality < _BESIDE_RAD:
+            target, sure = beside(found.grasp, found.curvatures), True
+        else:
+            target, sure = self._planned(found)
         if not sure and self.manner.taps:
             yield from self._open()
             felt = yield from self._feel_round(_touches(found))
@@ -260,7 +262,8 @@ class Skills(Feeling):
             d = one.apart_m + 2.0 * FINGER_M
             turned = abs(math.remainder(one.direction - held.direction, math.tau))
             if turned < _MOST_TURN and shift < 0.75 * held.apart_m and low < d < high - 2e-2:
-                return (one.x, one.y, one.direction, d, NEUTRAL, NEUTRAL), one.known
+                squeezed = found.force > 0.5 * self.manner.force_n  # else two light touches are little to know it by
+                return (one.x, one.y, one.direction, d, NEUTRAL, NEUTRAL), one.known and squeezed
         radius = 0.5 * sum(disk_radii(held))
         return (regrasp_disk(held, radius) if found.likeness is Likeness.DISK else regrasp_rectangle(held)), False
 
@@ -290,6 +293,7 @@ class Skills(Feeling):
         self.state = State.ROLL
         self.rolls += 1
         self._past.clear()  # the object moves
+        self._around = None
         manner, since, low, high = self.manner, self.now.time_s, *self.manner.arc
         latest_s = since + manner.roll_s
         self.say(f"roll from {_degrees(self._seen())}")
@@ -388,7 +392,7 @@ class Skills(Feeling):
 
 _PLACE_RAD = math.radians(0.02)  # what averaging does not take from a place: of the axes' and the array's own
 _HOLLOW = 15.0  # 1/m
-_BESIDE_RAD = math.radians(4.0)  # so near a parallel grasp that was felt the arcs that touch tell it
+_BESIDE_RAD = math.radians(6.0)  # so near a parallel grasp that was felt the arcs that touch tell it
 _MOST_TURN = math.radians(50.0)
 _SPARE = 1.2  # of an array's arc, where rolling is begun
 _LIGHT_N = 0.5  # below which curvatures are felt badly

@@ -11,11 +11,11 @@ import pytest
 from sioms.hand.contacts import Likeness, grasp_of
 from sioms.hand.kinematics import Hand
 from sioms.hand.plane import PlaneHand, Rig
-from sioms.hand.regrasp import regrasp_convex
+from sioms.hand.regrasp import beside, regrasp_convex
 from sioms.hand.rolling import RigidGrasp, correcting_law, friction_angle_rates, nearest_law
 from sioms.hand.skills import Skills
 from sioms.hand.touch import Failed, Fault, Manner, Setpoint, State
-from sioms.hand.trials import carry_out, draw
+from sioms.hand.trials import FAMILIES, carry_out, draw
 from sioms.plant.outline import Outline, disk, ellipse, rectangle
 from sioms.plant.planar import Body, Mount
 
@@ -296,3 +296,34 @@ def test_what_slides_at_a_touch_is_not_felt_any_longer() -> None:
     """
     found = carry_out(draw(9, 701, ("polygon", "hull")))
     assert found.friction > 1.5 and found.held and not found.dropped and found.fault is None
+
+
+def test_what_touches_a_finger_beside_its_array_is_not_pushed_away() -> None:
+    """Of a triangle felt round, finger 2 meets a corner at 155 degrees, its array ends at 143; it was turned away."""
+    subject = draw(21, 9402, FAMILIES)
+    mount = Mount(friction=subject.friction)
+    hand = PlaneHand(Body(subject.outline), subject.pose, Rig(free_m=1e-3), mount, seed=21)
+    skills = Skills(hand.hand, hand.reading)
+    poses: list[list[float]] = []
+
+    def look(hand: PlaneHand, _: Setpoint) -> None:
+        if skills.state is State.FEEL:
+            poses.append(list(hand.world.pose))
+
+    hand.seen = look
+    hand.run(skills.hold_parallel(0.2), 200.0)
+    assert skills.regrasps == 1 and hand.is_held() and hand.truth().quality < 1 * DEG
+    moved = [max(row) - min(row) for row in zip(*poses, strict=True)]
+    assert max(moved[:2]) < 1 * MM and moved[2] < 10 * DEG  # 80 degrees before
+
+
+def test_beside_a_parallel_grasp_the_arcs_lead_no_farther_than_the_friction_angles_tell() -> None:
+    held = rigid(ellipse(30 * MM, 20 * MM, 1e-9), 0.05, 0.5 * MM).grasp()
+    there = regrasp_convex(held, (75.0, 75.0))
+    near = beside(held, (75.0, 75.0))
+    turn, far = near[2] - held.direction, abs(there[2] - held.direction)
+    assert turn == pytest.approx(min(far, 2 * held.quality), rel=1e-6)
+    off = beside(held, (0.5, 0.5))  # arcs of two metres, whose centres lie anywhere
+    x, y = (0.5 * (a + b) for a, b in zip(held.contact1, held.contact2, strict=True))
+    assert math.hypot(off[0] - x, off[1] - y) <= 2 * held.quality * 14.3 * MM
+    assert abs(math.remainder(off[2] - held.direction, math.tau)) <= 2.001 * held.quality
