@@ -89,7 +89,7 @@ class Estimator:
         if not most_hollow >= 1.0:
             raise ValueError(f"make estimator: most_hollow is {most_hollow}; need 1 (flats) or more")
         self.finger = finger
-        self._table = finger.strain_table()
+        self._table = finger.strain_table().in_single_precision()
         self._widths = finger.width_table()
         self._solve = self._choose(compiled)
         self._poor_fit, self._contact_sigma = poor_fit, contact_sigma
@@ -141,7 +141,7 @@ class Estimator:
         bank = table.nodes[rows[:, None], columns, 0].reshape(rows.size * columns.size, -1)
         angle = table.first + table.step * columns
         square = table.half_widths[rows] ** 2
-        return np.ascontiguousarray(bank), np.stack(
+        return np.ascontiguousarray(bank, np.float64), np.stack(
             [np.tile(angle, rows.size), np.repeat(square, columns.size)], axis=1
         )
 
