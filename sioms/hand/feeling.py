@@ -222,7 +222,7 @@ class Feeling(Motions):
 _MIDDLE_RAD = math.radians(74.0)  # of an array
 FITS_RAD, _NEARLY_RAD = math.radians(0.5), math.radians(4.0)
 _PUSHES_M = 4e-3
-"""How far a finger that feels nothing stays behind what is wanted of it: some 0.06 N on its soft link; free ones 2 mm."""
+"""How far a finger that feels nothing stays behind what is wanted: some 0.06 N on its soft link; free ones 2 mm."""
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
 _FRAMES = 2  # times those of a grasp, for lighter touches
 _CREEP = 0.3  # of the closing speed, once it has met it
