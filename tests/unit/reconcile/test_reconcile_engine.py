@@ -164,6 +164,30 @@ def test_a_look_alike_is_open_only_where_it_misses_little() -> None:
     )
     assert [(r.rival, r.open) for r in rivals] == [("bow", True), ("wave", False)]
     assert alternative(rivals[0], ["slope"]) == ("bow",)
+    assert alternative(rivals[0], ["slope", "wave"]) == ("bow",), "what the rival made needless is no part of it"
+
+
+@pytest.mark.parametrize(
+    ("missed", "errors", "excess", "is_open"),
+    [
+        (0.01, 9.0, 9.0, True),  # misses less than it may
+        (0.5, 0.5, 0.1, True),  # a little worse, and not surely
+        (0.5, 3.0, 0.1, False),  # a little worse, and surely
+        (0.5, 0.5, 9.0, False),  # far worse, by a throw of dice or not
+    ],
+)
+def test_a_rival_is_ruled_out_where_it_is_surely_or_far_worse(
+    missed: float, errors: float, excess: float, is_open: bool
+) -> None:
+    fit = lines().fit(Line({}))
+    assert rules.Rival("slope", "wave", missed, 0.015, errors, excess, fit).open is is_open
+
+
+def test_a_loss_counts_for_nothing_where_it_is_small_or_neither_large_nor_sure() -> None:
+    assert rules.negligible(0.5 * rules.GAIN, 9.0)
+    assert rules.negligible(0.5 * rules.DOUBTFUL, 0.5)
+    assert not rules.negligible(0.5 * rules.DOUBTFUL, 3.0)
+    assert not rules.negligible(2.0 * rules.DOUBTFUL, 0.5)
 
 
 def test_numbers_are_set_as_they_are_read_and_phases_wrap() -> None:
@@ -206,6 +230,9 @@ def test_a_variable_orders_a_residual_or_chance_does_as_well() -> None:
     assert shown.explained > 0.4
     assert shown.p == pytest.approx(0.01)
     assert shown.means[-1] == pytest.approx(2.0, abs=0.5)
+    idle = rng.standard_normal(ROWS)
+    chance = place("time", "s", idle, T, bins, (rng.permutation(idle) for _ in range(99)), 1.0)
+    assert chance.p > 0.05 and shown.explained > 10.0 * chance.explained
 
 
 def test_an_effect_that_always_saves_does_so_in_every_replicate() -> None:

@@ -142,6 +142,19 @@ def test_a_drive_of_a_limited_rate_of_change_is_known_by_its_rate_and_is_no_lag(
     assert abs(found[0].values["rate"] - rate) < 0.01 * rate + 4.0 * found[0].errors["rate"]
 
 
+@pytest.mark.parametrize(("hz", "damping"), [(60.0, 0.4), (80.0, 0.7)])
+def test_a_drive_that_rings_is_doubted_whatever_law_is_nearest(hz: float, damping: float) -> None:
+    turn, step, rate = 2.0 * np.pi * hz, 1e-3 / 200, 0.0
+
+    def follow(now: float, goal: float) -> float:
+        nonlocal rate
+        rate += step * (turn**2 * (goal - now) - 2.0 * damping * turn * rate)
+        return now + step * rate
+
+    found, _ = drive(fine(STEPS, follow), AXIS)
+    assert len(found) == 1 and found[0].doubted
+
+
 def test_a_lag_of_the_same_steps_is_no_limited_rate() -> None:
     found, strays = drive(fine(STEPS, lambda now, goal: now + (goal - now) * 1e-3 / 200 / 4e-3), AXIS)
     assert [f.effect for f in found] == ["lag"] and not found[0].doubted and not strays
