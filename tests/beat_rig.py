@@ -326,7 +326,7 @@ def processes() -> Iterator[Callable[..., Process]]:
         patch.setattr(sioms.sdk.quiet, "library", object())
         patch.setattr(sioms.sdk.group, "time", SimpleNamespace(sleep=lambda _: None, monotonic_ns=CLOCK))
         patch.setattr(time, "monotonic_ns", CLOCK)
-        patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
+        patch.setattr("sioms.sdk.ticking.TimerFd", Timer)
 
         def make(hz: Sequence[float], phases: Sequence[float], *kind: Any) -> Process:
             made.append(Process(hz, phases, steps, *kind))

@@ -386,7 +386,7 @@ def own_time(world: list[World]) -> Iterator[None]:
         patch.setattr(sioms.client.node_core, "monotonic_ns", CLOCK)
         patch.setattr(sioms.client.node_core, "sleep", sleep)
         SENT.install(patch)
-        patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
+        patch.setattr("sioms.sdk.ticking.TimerFd", Timer)
         patch.setattr(sioms.sdk.quiet, "run", lambda record: world[0].run_quietly(record))
         patch.setattr(sioms.sdk.connected, "open_connection", lambda settings, _: world_device(world, settings))
         yield

@@ -570,7 +570,7 @@ def cells() -> Iterator[Callable[[], Cell]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(time, "monotonic_ns", CLOCK)
         patch.setattr(time, "sleep", lambda _: None)
-        patch.setattr("sioms.sdk.runtime.TimerFd", Timer)
+        patch.setattr("sioms.sdk.ticking.TimerFd", Timer)
         patch.setattr(Timestamps, "monotonic_ns", lambda *_: CLOCK())  # a request is served as soon as it is sent
         patch.setattr(sioms.daemon.clients, "Users", Users)
         patch.setattr(sioms.daemon.clients, "peer_of", _peer_of)

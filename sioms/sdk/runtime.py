@@ -51,11 +51,11 @@ from .pages import Pages
 from .parts import Parts, Service
 from .persistence import keep_positions
 from .quiet import QuietRun, quiet_run
-from .quiet_step import RESTED, STIRS, Quiet
-from .rt import ChangeWatch, TimerFd, settle
+from .rt import ChangeWatch, settle
 from .statistics import Reports, TickStatistics
 from .stops import Reason, Stop, Stops
 from .tick_engine import TickEngine
+from .ticking import Ticking
 
 STOP_GRACE_NS = 2_000_000_000
 """How long axes may take to stop before the process ends all the same."""
@@ -63,11 +63,9 @@ SETTLE_NS = 20_000_000
 """An axis whose loop is closed here follows its command by so much; only then is the loop given up."""
 FAIL_GRACE_NS = 500_000_000
 """How long a failed driver's line may take to send the stops."""
-SURE = 4
-"""One tick in so many leaves time for clients' work however long it took."""
 
 
-class Runtime:
+class Runtime(Ticking):
     """A driver process, or its part for one device; the driver sees it as its ``Kit``.
 
     Concurrency: one thread.
@@ -77,13 +75,12 @@ class Runtime:
         self, driver: type[Driver], device: str, settings: Any, generation: int, options: Mapping[str, Any],
         fds: Sequence[int],
     ) -> None:  # fmt: skip
+        super().__init__()
         self.device = device
-        self.tick = 0
         self.running = True
         self.journal = JournalWriter(memoryview(mmap.mmap(fds[6], HEADER + JOURNAL_SIZE)))
         self.effects = Effects()
         self.waits = Waits(self.effects, self.journal, self.log)
-        self.looked_ns = 0
         self.outputs = Outputs()
         self.statistics = TickStatistics()
         self._control = Control(fds[0], self._watch_room)
@@ -104,26 +101,14 @@ class Runtime:
         self._epoll = select.epoll()
         self._callbacks: dict[int, Callable[[], None]] = {}
         self.turns = Turns(self._epoll, SHARES)
-        self._timer = TimerFd()
-        self._line_timer = TimerFd()
-        self._line_due_ns: int | None = None
         self._stopped = options["stopped"]
         self._phase = float(options["phase"])
         self._daemon_lease_ns = int(float(options["daemon_lease_s"]) * 1e9)
-        self._daemon_late = False
-        self._ending_ns = 0
         self._moved_ns = 0
-        self._is_ticking = False
-        """Whether there is yet to be a tick of what is heeded now."""
-        self._ticked_ns = 0
-        self._brakes = False
-        """Whether steps have begun the stop that is being heeded."""
-        self._braked_ns = 0
-        """When something was stopped last [ns]."""
         self.driver = driver.variant(settings)(device, settings, self)
         self.blocks = list(self.driver.blocks)
         self._kept = keep_positions(str(options["state_folder"]), device, self.blocks, self.log)
-        self._keep_ns, self._kept_ns = lease_ns // 4, 0
+        self._keep_ns = lease_ns // 4
         self.pages = Pages(device, self.blocks, lease_ns, generation, self._link_changed)
         handles: dict[int, Handle] = {}
         self.stops = Stops(
@@ -149,9 +134,8 @@ class Runtime:
         self._idling = Idling(self.period_ns, lease_ns)
         self._stops_workcell = bool(options["stop_sources"])
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
-        self._announced = self._slack_ns = self._spare_until_ns = 0
-        self._expired, self.sees_requests = 0, False
-        self._quiet: QuietRun | None = None
+        self.sees_requests = False
+        self._quiet = None
 
     # --- services to the driver (Kit) ------------------------------------------------------------
 
@@ -181,10 +165,6 @@ class Runtime:
     def deadline(self, timeout_s: float | None) -> int | None:
         """Return when a time-out that begins now ends [ns]."""
         return None if timeout_s is None else time.monotonic_ns() + int(min(max(timeout_s, 0.0), 1e6) * 1e9)
-
-    def has_time(self) -> bool:
-        """Whether what can be done in pieces may do another before the next tick."""
-        return time.monotonic_ns() < self._spare_until_ns
 
     def watch(self, fd: int, callback: Callable[[], None]) -> None:
         """Call back when a descriptor is readable or hung up."""
@@ -220,12 +200,6 @@ class Runtime:
             held.stop()
         self._wake()
         self.tick_early()
-
-    def set_line_timer(self, when_ns: int | None) -> None:
-        """Have the engine's ``line_due`` called at a time, None = not; of a TickEngine, an early tick."""
-        if when_ns != self._line_due_ns:  # most bytes that come change nothing about it
-            self._line_due_ns = when_ns
-            self._line_timer.set(0 if when_ns is None else max(when_ns, 1))
 
     def _link_changed(self, blocks: Sequence[AnyBlock], state: PageState, reason: str) -> None:
         self.journal.note(Note.LINK, time.monotonic_ns(), state.name, printable(reason))
@@ -380,185 +354,6 @@ class Runtime:
         quiet.run()
         return self.take_back(quiet)
 
-    def lend(self) -> QuietRun | None:
-        """Let steps tick while the process waits; return None when they may not, or there are none."""
-        early_ns = 0 if self._announced else self._line_due_ns or 0
-        if self._quiet is None or self._ending_ns or self._daemon_late or self.pause_s is not None:
-            return None
-        watched = bool(self.clients.handles) or self._orders.is_used
-        lent = self._quiet.lend(
-            self._scheduled_ns, self.tick, watched, self._announced, self._slack_ns, early_ns, self._ticked_ns,
-            self.looked_ns, self._braked_ns,
-        )  # fmt: skip
-        return self._quiet if lent else None
-
-    def take_back(self, quiet: QuietRun) -> list[int]:
-        """Go on after ``lend``; return the descriptors that are ready."""
-        ready = quiet.take_back()
-        self._resume(quiet.record)
-        quiet.desk.take_back(self.tick)
-        if quiet.record.heeded_ns:
-            self.heed_requests()
-            self._brakes = False
-        return ready
-
-    def _resume(self, quiet: Quiet) -> None:
-        """Go on behind ticks that have been done by steps."""
-        self._expired = quiet.expired
-        self._announced, self._slack_ns = quiet.announced, quiet.worked_ns
-        due_ns = quiet.scheduled_ns + quiet.announced * self.period_ns if quiet.announced else quiet.early_ns
-        self._line_due_ns = due_ns or None
-        self._brakes, self._braked_ns = quiet.brakes > 0, quiet.braked_ns
-        if not quiet.done:
-            return
-        self.tick, self.looked_ns = quiet.number, quiet.heeded_ns or quiet.began_ns
-        self._scheduled_ns, self._ticked_ns = quiet.scheduled_ns, quiet.ticked_ns
-        if quiet.slackens and isinstance(self.engine, TickEngine):
-            self.engine.slack(time.monotonic_ns(), self._scheduled_ns + self.period_ns)
-        if quiet.told == STIRS:
-            self._wake()
-        elif quiet.told == RESTED:
-            self._be_idle(time.monotonic_ns())
-        self._spare_until_ns = self._spare_until(self._scheduled_ns)
-
-    def tick_early(self) -> None:
-        """Have a tick as soon as there can be one: what has been stopped shall not wait for its turn."""
-        if self._brakes:  # by steps, which have seen to that
-            return
-        self._braked_ns = time.monotonic_ns()
-        if self._lead_ns and not self._is_ticking and not self._announced:  # the next of frequent ticks comes as soon
-            self._tick_soon()
-
-    def _tick_soon(self) -> None:
-        """Have a tick off the grid, unless the next one comes as soon; see ``quiet_step.tick_soon``.
-
-        A loop that is closed here measures velocities over the time between two ticks; a quarter of the usual one is
-        the least that it gets.
-        """
-        early_ns = max(time.monotonic_ns(), self._ticked_ns + self.period_ns // 4)
-        if early_ns <= self._last_early_ns:
-            self.set_line_timer(early_ns)
-
-    @property
-    def _last_early_ns(self) -> int:
-        """When a tick off the grid may be at the latest [ns]."""
-        return self._scheduled_ns + self.period_ns - self.period_ns // 4
-
-    def _early_tick(self) -> None:
-        now_ns = time.monotonic_ns()
-        if now_ns > self._last_early_ns:
-            return  # see quiet_step.early_tick
-        self._is_ticking = True
-        try:
-            self.tick += 1
-            self._look_around(now_ns)
-            self.after_publication(self._tick_and_publish(now_ns), self.blocks if self.engine.publishes else ())
-        finally:
-            self._is_ticking = False
-
-    def _on_timer(self) -> None:
-        expired, self._expired = self._expired or self._timer.expirations(), 0
-        if not expired:
-            return
-        if self._lead_ns and self._idling.periods == 1 and isinstance(self.engine, TickEngine):
-            began_ns = time.monotonic_ns()
-            if self._announced and self._scheduled_ns + self._announced * self.period_ns > began_ns:
-                return  # see quiet_step.announce
-            self._announced += expired
-            due_ns = self._scheduled_ns + self._announced * self.period_ns
-            self.engine.slack(began_ns, due_ns)
-            self._slack_ns = time.monotonic_ns() - began_ns
-            self.set_line_timer(due_ns)
-        else:
-            self._tick_on_time(expired)
-
-    def _tick_on_time(self, expired: int) -> None:
-        self._announced = 0
-        self._is_ticking = True
-        try:
-            self._usual_tick(expired)
-        finally:
-            self._is_ticking = False
-
-    def _usual_tick(self, expired: int) -> None:
-        periods = self._idling.periods
-        self._scheduled_ns += expired * periods * self.period_ns
-        self.statistics.skipped += (expired - 1) * periods
-        scheduled_ns = self._scheduled_ns
-        engine, slack_ns = self.engine, self._slack_ns
-        if isinstance(engine, TickEngine):
-            self._line_due_ns = None  # an early tick that has not come by now comes with this one
-        began_ns = time.monotonic_ns()
-        self.tick += 1
-        self._look_around(began_ns)
-        if began_ns - self.latch.daemon_alive_ns > self._daemon_lease_ns:
-            self._miss_daemon()
-        elif self._daemon_late:
-            self._daemon_late = False
-        self.clients.check_leases(began_ns)
-        if self.held and began_ns - self._kept_ns > self._keep_ns:
-            self._kept_ns = began_ns
-            for held in self.held.values():
-                held.keep()
-        ticked_ns = self._tick_and_publish(scheduled_ns)
-        self._spare_until_ns = self._spare_until(ticked_ns)
-        self.after_publication(ticked_ns, self.blocks if engine.publishes else ())
-        ended_ns = time.monotonic_ns()
-        self.statistics.record(scheduled_ns, began_ns, self.driver.inputs_ns, ticked_ns, ended_ns)
-        if self._ending_ns:
-            self._maybe_end(ended_ns)
-        elif isinstance(engine, TickEngine):
-            if not self._lead_ns:
-                engine.slack(ended_ns, scheduled_ns + self.period_ns)
-                slack_ns = time.monotonic_ns() - ended_ns
-            self.statistics.record_slack(slack_ns)
-            if not self.clients.handles:
-                self._rest(engine, ended_ns)
-
-    def _rest(self, engine: TickEngine, now_ns: int) -> None:
-        """Tick seldom when nobody looks and nothing has happened for a while."""
-        if self._orders.is_used or self._stops_workcell or not engine.is_at_rest():
-            self._wake()
-        else:
-            self._be_idle(now_ns)
-
-    def _be_idle(self, now_ns: int) -> None:
-        if self._idling.rest(now_ns):
-            idle_ns = self._idling.periods * self.period_ns
-            self._beat(self._scheduled_ns + idle_ns, idle_ns)
-
-    def _wake(self) -> None:
-        """Tick at the full rate again, beginning now: something has happened, or is going to."""
-        now_ns = time.monotonic_ns()
-        if not self._idling.wake(now_ns):
-            return
-        self._scheduled_ns += (now_ns - self._scheduled_ns) // self.period_ns * self.period_ns
-        self._beat(self._scheduled_ns + self.period_ns - self._lead_ns, self.period_ns)
-        if not self._is_ticking:
-            self._tick_soon()
-
-    def _beat(self, first_ns: int, period_ns: int) -> None:
-        """Have the timer announce ticks from an instant on. What it has announced before, and has yet to come, is of
-        another beat: counted from the new one it would lie ahead for ever.
-        """
-        self._timer.set(first_ns, period_ns)
-        self._expired = self._announced = 0
-
-    def _spare_until(self, ticked_ns: int) -> int:
-        """Return until when pieces of clients' work may begin after a tick [ns].
-
-        The first half of the period holds tick and pieces together, so that what clients have the tick do leaves them
-        less; one tick in SURE leaves a quarter in any case, else a tick that is always long would leave them nothing.
-        """
-        quarter_ns = ticked_ns + self.period_ns // 4
-        half_ns = self._scheduled_ns + self.period_ns // 2
-        return quarter_ns if self.tick % SURE == 0 else min(quarter_ns, half_ns)
-
-    def _look_around(self, began_ns: int) -> None:
-        """Heed what is asked for; what was asked for before ``began_ns`` is done with this tick."""
-        self.heed()
-        self.looked_ns = began_ns
-
     def heed(self) -> None:
         """Heed the daemon's orders, then the latch and the stop-request file; cheap when there is nothing new."""
         if self.stops.heed_orders():
@@ -566,33 +361,6 @@ class Runtime:
                 self._wake()
                 self._orders.obey(order, [])
         self.stops.heed()
-
-    def _tick_and_publish(self, scheduled_ns: int) -> int:
-        """Return when the tick itself was done."""
-        engine = self.engine
-        self._ticked_ns = scheduled_ns
-        engine.tick(scheduled_ns)
-        self._is_ticking = False
-        if self._lead_ns and self._braked_ns >= scheduled_ns:  # it does not show in a tick for an instant before
-            self._tick_soon()
-        ticked_ns = time.monotonic_ns()
-        self.pages.alive(ticked_ns)
-        if isinstance(engine, TickEngine) and engine.publishes:
-            for block in self.blocks:
-                self.publish(block, block.stamp_ns or scheduled_ns)
-        return ticked_ns
-
-    def _on_line_timer(self) -> None:
-        self._line_timer.expirations()
-        if self._line_due_ns is None or self._line_due_ns > time.monotonic_ns():
-            return  # it has been set anew since it expired
-        self._line_due_ns = None
-        if self._announced:
-            self._tick_on_time(self._announced)
-        elif isinstance(self.engine, TickEngine):
-            self._early_tick()
-        else:
-            self.engine.line_due()
 
     def fail(self, error: Exception) -> None:
         """Stop first, report second: the driver has raised what it should not have."""
