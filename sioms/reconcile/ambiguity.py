@@ -5,11 +5,18 @@ the effect's contribution that the look-alike cannot reproduce; below ``AMBIGUOU
 error on held-out blocks) these data do not tell the two apart, however small the formal intervals are:
 what separates them then is a transient or two, where unmodelled effects live. Where the gate has found, before any
 fit, that two effects leave one and the same trace, more than that is needed: ``ALIKE``.
+
+A share says nothing of the noise: a force that makes sixty times the noise may be reproduced but for a hundredth, and
+seven times the noise remain. Such a rival is ruled out where the named model comes down to the noise, what the rival
+leaves more is far beyond all that the named model leaves, unmodelled or not, and nearly every block of time tells it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from sioms.reconcile import rules
 from sioms.reconcile.blocks import better
@@ -17,12 +24,26 @@ from sioms.reconcile.bounces import rattles
 from sioms.reconcile.effect import Slot
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
+from sioms.reconcile.noise import effective_samples
 from sioms.reconcile.plausible import physical, size
 from sioms.reconcile.search import Found, Searcher
-from sioms.reconcile.thresholds import ALIKE, AMBIGUOUS, GAIN, ROUGH, SAME_TRACE, SURE
+from sioms.reconcile.thresholds import (
+    ALIKE,
+    AMBIGUOUS,
+    EACH_BLOCK,
+    FAR_WORSE,
+    GAIN,
+    LOUD,
+    NEARLY_EACH,
+    ROUGH,
+    SAME_TRACE,
+    SURE,
+)
 from sioms.reconcile.variation import accompanied, named
 
 Rival = rules.Rival[Fit]
+#: Of fewer blocks of time "nearly every one" says little.
+FEWEST = 6
 
 
 def _wins(r: Rival) -> bool:
@@ -56,7 +77,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
                 allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
                 yield start.effect, fit, ROUGH if rattles(model) else allowed, None
 
-    return rules.closest(
+    closest = rules.closest(
         [
             *rules.weighed(
                 found,
@@ -67,6 +88,26 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
             ),
             *_for_several(searcher, found),
         ]
+    )
+    return [
+        replace(r, told=told) if r.missed_little and r.allowed < ALIKE and (told := _told(searcher, found, r)) else r
+        for r in closest
+    ]
+
+
+def _told(searcher: Searcher, found: Found, r: Rival) -> str:
+    """Say how a rival is told by its remains from a model that comes down to the noise; empty: it is not."""
+    fit = found.fit
+    if rattles(fit.model) or rattles(r.fit.model) or fit.ratio > LOUD or r.excess < FAR_WORSE:
+        return ""
+    per_row = effective_samples(fit.residual) / len(fit.residual)
+    likelier = 0.5 * per_row * (searcher.loss(r.fit) - found.losses) / fit.ratio**2
+    share = float(np.mean(likelier > EACH_BLOCK))
+    if share < NEARLY_EACH or len(likelier) < FEWEST:
+        return ""
+    return (
+        f"leaves {r.fit.ratio / fit.ratio:.2g} times as much as what is named, which is told in {100 * share:.0f} % of "
+        f"{len(likelier)} blocks of time"
     )
 
 

@@ -21,8 +21,11 @@ from sioms.reconcile.records import Record, Session
 from sioms.reconcile.screen import low_passed
 from sioms.reconcile.timing import LEAST_SAMPLES
 
-#: The acceleration is that of the measured motion up to so many Hz, or up to this share of the rate of the rows.
-UP_TO_HZ, OF_RATE = 25.0, 0.1
+#: The acceleration is that of the measured motion up to so many Hz, or up to this share of the rate of the rows; up to
+#: twice, four times, ... as many, and to the second share, where noise of the position makes less than the last of it.
+UP_TO_HZ, OF_RATE, FASTEST, CLEAN = 25.0, 0.1, 0.25, 0.05
+#: Periods of that frequency at either end of a record that are left out.
+EDGE = 2.0
 #: Noise of the position makes less than this share of it.
 OF_NOISE = 0.5
 #: The speed changes by this share of the largest, or it does not.
@@ -53,6 +56,7 @@ def carried(session: Session, nominal: AxisModel) -> tuple[Session, AxisModel]:
         raise BadInputError(f"read records: the {what} never changes; needs motion to and fro, and the force it takes")
     _check_resolved(every, hz, dt)
     _check_sign(every, hz, dt)
+    hz = _as_fast_as_told(every, hz, nominal)
     inertia = pushed / _size([_acceleration(r, hz, dt) for r in every])
     return _laid(session, inertia, hz, dt), replace(nominal, inertia=nominal.inertia + inertia)
 
@@ -64,15 +68,30 @@ def _check_resolved(records: Sequence[Record], hz: float, dt: float) -> None:
         BadInputError: it is not; friction at low speed would be read into the steps of an encoder.
     """
     noise = _size([r.position - low_passed(r.position, hz, dt) for r in records])
-    # of white noise, twice differentiated, up to that frequency
-    made = noise * np.sqrt(2.0 * hz * dt / 5.0) * (2.0 * np.pi * hz) ** 2
-    share = made / _size([_acceleration(r, hz, dt) for r in records])
+    share = _made(noise, hz, dt) / _size([_acceleration(r, hz, dt) for r in records])
     if share > OF_NOISE:
         raise BadInputError(
             f"read records: noise or steps of the position, {noise:.2g} root mean square, make {100 * share:.0f} % of "
             f"the acceleration up to {hz:.3g} Hz; needs {100 * OF_NOISE:.0f} % or less: a finer sensor of position, or "
             "faster motion"
         )
+
+
+def _made(noise: float, hz: float, dt: float) -> float:
+    """Return the acceleration that white noise of the position makes, up to a frequency, root mean square."""
+    return float(noise * np.sqrt(2.0 * hz * dt / 5.0) * (2.0 * np.pi * hz) ** 2)
+
+
+def _as_fast_as_told(records: Sequence[Record], hz: float, nominal: AxisModel) -> float:
+    """Return the highest frequency up to which the acceleration is hardly noise: a turn may be over in a few rows."""
+    dt = nominal.sample_time_s
+    third = np.abs(np.concatenate([np.diff(r.position, 3) for r in records]))
+    noise = max(1.4826 * float(np.median(third)) / np.sqrt(20.0), nominal.resolution / np.sqrt(12.0))
+    while 2.0 * hz * dt <= FASTEST:
+        if _made(noise, 2.0 * hz, dt) > CLEAN * _size([_acceleration(r, 2.0 * hz, dt) for r in records]):
+            break
+        hz *= 2.0
+    return hz
 
 
 def _check_sign(records: Sequence[Record], hz: float, dt: float) -> None:
@@ -96,8 +115,11 @@ def _check_sign(records: Sequence[Record], hz: float, dt: float) -> None:
 
 
 def _laid(session: Session, inertia: float, hz: float, dt: float) -> Session:
+    edge = round(EDGE / (hz * dt))  # where the filter knows one side only
+
     def lay(records: Sequence[Record]) -> tuple[Record, ...]:
-        return tuple(replace(r, force=r.force + inertia * _acceleration(r, hz, dt)) for r in records)
+        laid = (replace(r, force=r.force + inertia * _acceleration(r, hz, dt)) for r in records)
+        return tuple(r.cut(edge, len(r) - edge) for r in laid)
 
     halves = tuple(_laid(half, inertia, hz, dt) for half in session.halves)
     return replace(session, records=lay(session.records), final=lay(session.final), halves=halves, loop_time_s=0.0)

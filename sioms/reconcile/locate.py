@@ -89,8 +89,10 @@ def variables(motions: list[Motion], model: AxisModel, dead: float) -> dict[str,
             [(np.arange(len(m.x)) + t) * model.sample_time_s for m, t in zip(motions, time, strict=False)],
         ),
     }
-    if model.imposed:
+    if model.imposed:  # which has no motor, and no screw
         del out["motor force"], out["heat"]
+        within = out.pop("position in the pitch")
+        out |= {"angle in the turn": within} if model.rotary else {}
     return out
 
 

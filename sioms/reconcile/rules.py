@@ -40,6 +40,7 @@ class Rival(Generic[F]):
         allowed: share below which it is not ruled out.
         errors: by how many standard errors it is worse on held-out blocks.
         excess: by how much more than the named model it leaves, as a share of what that leaves.
+        told: how the records tell it apart though it reproduces nearly all of the effect; empty: they do not.
     """
 
     effect: str
@@ -49,10 +50,16 @@ class Rival(Generic[F]):
     errors: float
     excess: float
     fit: F
+    told: str = ""
 
     @property
     def open(self) -> bool:
         """True where the data do not rule the rival out."""
+        return not self.told and self.missed_little
+
+    @property
+    def missed_little(self) -> bool:
+        """True where it reproduces nearly all of the effect, or is hardly worse on held-out blocks."""
         return self.missed < self.allowed or (self.errors < 1.0 and self.excess < DOUBTFUL)
 
 
@@ -128,7 +135,8 @@ def told_apart(
         if rival in lookalikes and rival not in present and rival not in still
     }
     refitted = {
-        r.rival: f"leaves {100 * r.missed:.1f} % of the effect unexplained, {r.errors:.1f} standard errors worse"
+        r.rival: r.told
+        or f"leaves {100 * r.missed:.1f} % of the effect unexplained, {r.errors:.1f} standard errors worse"
         for r in mine
         if not r.open
     }

@@ -44,6 +44,10 @@ OF_AXES = (
     "small errors add up; in short windows it is corrected by the measurement all along, and its error is given as a "
     "force."
 )
+OF_RIGS = (
+    "Root mean square on held-out samples, which were not used for any choice: of the force that the motion takes, "
+    "measured and by the model, over short windows."
+)
 OF_SENSORS = (
     "Root mean square on held-out touches or loads (every fifth), which were not used for any choice. The parameters "
     "of the model are fixed; the zero, the true load of a touch and the level of a ramp are estimated for the session "
@@ -208,7 +212,7 @@ def _quantity(mine: list[Estimate]) -> tuple[object, ...]:
 
 def _gaps(p: Page, v: Verdict) -> None:
     of_axis = isinstance(v, AxisVerdict)
-    p.text(OF_AXES if of_axis else OF_SENSORS)
+    p.text(OF_SENSORS if not of_axis else OF_RIGS if v.nominal.imposed else OF_AXES)
     p.text(f"{FLOOR} The verdict rests on the row '{v.speaking.channel}'.")
     head = ["channel", "before", "after", "noise floor", "unit", "what remains", "gap closed", "floor from"]
     rows = []

@@ -17,6 +17,7 @@ from sioms.reconcile.live.axis import Live, live
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.model_file import parse_model, write_model
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.report.page import page
 from sioms.reconcile.twin import from_files
 from sioms.reconcile.verdict import Outcome
 
@@ -47,12 +48,13 @@ def moved(law: Law, seed: int) -> Session:
     [
         (lambda x, v, a: 30.0 * np.sign(v) * np.abs(v) ** 0.6, {"power_drag": {"c": 30.0, "n": 0.6}}),
         (lambda x, v, a: 0.8 * a + 3.0 * np.sign(v), {"coulomb": {"Fc": 3.0}, "payload": {"J_extra": 0.8}}),
+        (lambda x, v, a: 3.0 * np.sign(v) + 20.0 * v, {"coulomb": {"Fc": 3.0}, "viscous": {"b_extra": 20.0}}),
         (
             lambda x, v, a: np.where(v > 0.0, 60.0, 25.0) * v,
             {"viscous": {"b_extra": 42.5}, "viscous_direction": {"b_dir": 17.5}},
         ),
     ],
-    ids=["damper", "dry friction of a mass", "damper with a valve"],
+    ids=["damper", "dry friction of a mass", "dry and viscous friction", "damper with a valve"],
 )  # fmt: skip
 def test_what_a_motion_takes_is_named(law: Law, expected: dict[str, dict[str, float]]) -> None:
     verdict = reconcile.analyse(moved(law, 11), RIG)
@@ -60,6 +62,49 @@ def test_what_a_motion_takes_is_named(law: Law, expected: dict[str, dict[str, fl
     found = {e.name: {p.symbol: p.value for p in e.parameters} for e in verdict.effects}
     assert found == {name: pytest.approx(numbers, rel=5e-3) for name, numbers in expected.items()}
     assert verdict.model.inertia == 0.0 and all(g.unit == "N" for g in verdict.gaps)
+
+
+def stroked(law: Law, seed: int) -> Session:
+    """Strokes at constant speeds, turned round within 50 ms."""
+    rng, fine = np.random.default_rng(seed), DT / 4
+    records = []
+    for i in range(2):
+        speeds, sign = [], 1.0
+        while len(speeds) < 32000:
+            speed = rng.choice([0.02, 0.05, 0.1, 0.2])
+            speeds += [sign * speed] * int(0.08 / speed / fine)
+            sign = -sign
+        turn = int(0.05 / fine)
+        v = np.convolve(speeds[:32000], np.ones(turn) / turn, "same")
+        x = np.cumsum(v) * fine
+        force = law(x, v, np.gradient(v, fine))[::4]
+        force = force + rng.normal(scale=0.02 * np.std(force), size=len(force))
+        records.append(Record(f"strokes {i}", STEP * np.round(x[::4] / STEP), force, time_s=DT * np.arange(8000)))
+    return Session(tuple(records))
+
+
+@pytest.mark.parametrize(
+    ("law", "expected"),
+    [
+        (lambda x, v, a: 3.0 * np.sign(v) + 20.0 * v, {"coulomb": {"Fc": 3.0}, "viscous": {"b_extra": 20.0}}),
+        (lambda x, v, a: 40.0 * v, {"viscous": {"b_extra": 40.0}}),
+    ],
+    ids=["dry and viscous friction", "damper"],
+)
+def test_constant_speeds_with_short_turns_are_enough(law: Law, expected: dict[str, dict[str, float]]) -> None:
+    verdict = reconcile.analyse(stroked(law, 3), RIG)
+    assert verdict.outcome is Outcome.NAMED
+    found = {e.name: {p.symbol: p.value for p in e.parameters} for e in verdict.effects}
+    assert found == {name: pytest.approx(numbers, rel=5e-3) for name, numbers in expected.items()}
+
+
+def test_the_report_on_a_rig_has_the_words_of_a_rig(tmp_path: Path) -> None:
+    verdict = reconcile.analyse(moved(lambda x, v, a: 40.0 * v, 12), RIG)
+    page(verdict, 1.0, draw=False).write(tmp_path / "report.html")
+    html = (tmp_path / "report.html").read_text()
+    for foreign in ("closed loop", "controller", "pitch", "motor", "encoder zero", "drive"):
+        assert foreign not in html, foreign
+    assert "of the force that the motion takes" in html
 
 
 def test_a_damper_that_is_as_stated_lacks_nothing() -> None:
