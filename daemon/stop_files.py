@@ -35,8 +35,8 @@ class StopFiles:
         fd: of the request file, for the daemon and the drivers.
         taken_fd: of the file that says which request has been taken, for the same.
         client_fds: the two for clients that may stop: to write the one, to read the other.
-        unheard: who asked for a stop that the daemon before this one and its drivers did not live to hear, '' for
-            nobody.
+        unheard: word of the last stop that was asked for of which nobody has said that it was obeyed, and who asked; 0:
+            there is none.
     """
 
     def __init__(self, path: str) -> None:
@@ -90,21 +90,21 @@ class StopFiles:
                 os.unlink(self._path + end)
 
 
-def _unheard(path: str) -> str:
-    """Return who has written to files left by another daemon and has not been heard."""
+def _unheard(path: str) -> tuple[int, str]:
+    """Return what was written to files left by another daemon and has not been heard, and by whom."""
     fds: list[int] = []
     try:
         for end in (REQUEST, TAKEN):
             fds.append(os.open(path + end, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC))
             about = os.fstat(fds[-1])
             if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid():
-                return ""
+                return 0, ""
         request = StopRequest(fds[0], os.dup(fds[1]))
         fds.pop(0)
         word = request.mark[0]
-        return request.source if word and not request.taken(word) else ""
+        return (word, request.source) if word and not request.taken(word) else (0, "")
     except FileNotFoundError:
-        return ""
+        return 0, ""
     finally:
         for fd in fds:
             os.close(fd)

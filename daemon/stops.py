@@ -44,8 +44,9 @@ class Stops:
             self._cell.log("warning", "still stopped", source=self._shared.latch.source)
         for node, source in stopped.nodes():
             self._cell.log("warning", "still stopped", node=node, source=source)
-        if self._shared.files.unheard:
-            self.stop_workcell(self._shared.files.unheard)
+        word, source = self._shared.files.unheard
+        if word and word != stopped.request:  # a driver that was late may have said that it has obeyed the one before
+            self.stop_workcell(source)
 
     def stop_workcell(self, source: str, by: int = 0, asked_ns: int = 0) -> None:
         """Latch the emergency stop, wake every driver, and keep it.

@@ -136,6 +136,7 @@ class Cell:
         self.record = StopRecord(self.path + ".stops")
         listening = SimpleNamespace(sock=self.listener, path=self.path)
         self.server = Server(loop, listening, str(self.config), Log(level="error"), self.record)  # type: ignore[arg-type]
+        self.latch = self.server.cell.shared.latch
         self._load()
 
     def _configure(self) -> None:
@@ -333,7 +334,7 @@ class Cell:
         if self.server is not None:
             self.server.cell.shared.latch.daemon_alive(CLOCK())
         else:
-            process.runtime.latch.daemon_alive(CLOCK())
+            self.latch.daemon_alive(CLOCK())
         process.tick(1)
 
     def lapse(self, d: int) -> None:

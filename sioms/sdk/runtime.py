@@ -85,7 +85,7 @@ class Runtime(Ticking):
         self.statistics = TickStatistics()
         self._control = Control(fds[0], self._watch_room)
         self.tell = self._control.tell
-        latch = mmap.mmap(fds[1], LATCH_SIZE)
+        latch = mmap.mmap(fds[1], LATCH_SIZE, prot=mmap.PROT_READ)  # the daemon alone writes it
         self.latch, self._latch_words = Latch(memoryview(latch)), np.frombuffer(latch, dtype=np.int64, count=8)
         request, self._request_fd = StopRequest(fds[2], fds[3]), fds[2]
         table = MarkerTable(memoryview(mmap.mmap(fds[4], TABLE_SIZE)))

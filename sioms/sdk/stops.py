@@ -148,7 +148,7 @@ class Stops(Resets):
         Who is stopped stays so until a reset is seen: what a reset that is under way has written so far counts as
         nothing, and what it has not answered is a stop.
         """
-        latch, (_, seen_resets, _) = self._latch, self._seen
+        latch, (_, seen_resets, seen_mark) = self._latch, self._seen
         resets = -1
         while latch.resets != resets:
             resets = latch.resets
@@ -158,7 +158,7 @@ class Stops(Resets):
         is_missed = is_reset and self._note_workcell_reset()
         if (is_stopped and (is_reset or not self.stopped)) or is_missed:
             self._stop_here(self.source)
-        if is_asked:
+        if is_asked or mark != seen_mark:
             self._take_request()
         if is_reset:
             self._effects.note()
@@ -173,14 +173,17 @@ class Stops(Resets):
         self.safe_stop(_emergency_stop_by(source))
 
     def _take_request(self) -> None:
-        """Note the stop that somebody asks for by the file, once, and say that it has been obeyed."""
+        """Note the stop that somebody asks for by the file, once, and say that it has been obeyed; look again behind
+        that, as others may have obeyed a later one meanwhile.
+        """
         latch = self._latch
         while True:
             resets, mark, answered = latch.resets, self._request.mark, latch.answered_request
-            if mark == answered or (resets, mark) == self._taken:
+            if (resets, mark) == self._taken:
                 return
-            word = mark[0] if answered[0] < mark[0] <= time.monotonic_ns() else 0
-            self._note(workcell_entry(self._request.source, stop=True, resets=resets, request=word))
+            if mark != answered:
+                word = mark[0] if mark[0] <= time.monotonic_ns() else 0  # anybody can write any
+                self._note(workcell_entry(self._request.source, stop=True, resets=resets, request=word))
             self._request.take(mark)
             self._taken = resets, mark
 

@@ -95,7 +95,8 @@ def meetings(
                 cell.take(action)
             assert cell.server is not None
             sent_ns = CLOCK()
-            patch.setattr(Timestamps, "monotonic_ns", lambda *_, sent_ns=sent_ns: sent_ns)
+            if inside == "reset":
+                patch.setattr(Timestamps, "monotonic_ns", lambda *_, sent_ns=sent_ns: sent_ns)
             mine = cell.server.cell.shared.latch if inside == "reset" else cell._process(AXIS).runtime.latch
             if dies:
                 patch.setattr(mine, "reset", functools.partial(_die_after, mine.reset))
@@ -127,6 +128,26 @@ def test_a_request_that_a_reset_has_answered_is_over(seen: bool, inside: str) ->
         assert not cell._process(AXIS).runtime.stops.stopped, place
         assert not cell.record.state.workcell, place
         assert cell.take(("move", OWNER, AXIS)) == "done", place
+
+
+@pytest.mark.parametrize("goes_on", [False, True])
+def test_a_request_that_a_reset_has_answered_stops_no_later_daemon(goes_on: bool) -> None:
+    """A driver that is late says that it has obeyed the request before; it may die before it looks again."""
+    later: list[Action] = [("beat",), ("reset", RESETTER), ("request_stop", LATER), ("beat",), ("reset", RESETTER)]
+
+    def act(cell: Cell) -> None:
+        for action in later:
+            CLOCK.now_ns += 20_000_000
+            assert cell.take(action) != "refused"
+
+    for cell, place, _ in meetings([("request_stop", STOPPER)], "tick", act):
+        if goes_on:
+            cell.take(("tick", AXIS))
+        cell.take(("crash",))
+        for device in (0, 1):
+            cell.take(("kill", device))
+        cell.take(("boot",))
+        assert cell.server is not None and not cell.server.cell.shared.latch.stopped_ns, place
 
 
 @pytest.mark.parametrize("dies", [False, True])
