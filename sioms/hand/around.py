@@ -205,6 +205,20 @@ class Around:
         self.tried(x, y, psi)
         self.smooth = self._wrong[1] < self._wrong[0]
 
+    def spare_m(self, touches: Sequence[Touch]) -> float:
+        """Return how far added touches lie from the nearest end of a side that they are on [m]; infinite off sides."""
+        if self.smooth:
+            return math.inf
+        sides, least = sides_through(self._touches), math.inf
+        for number, touch in enumerate(self._touches):
+            for first, owners in enumerate(sides.owners):
+                along = sides.corners[(first + 1) % len(sides.corners)] - sides.corners[first]
+                length = math.hypot(*along)
+                if number in owners and length > _END_M and any(touch is one for one in touches):
+                    at = float((sides.points[number] - sides.corners[first]) @ along) / length
+                    least = min(least, max(min(at, length - at), 0.0))
+        return least
+
     def _sides_outline(self) -> tuple[Array, float]:
         sides = sides_through(self._touches)
         return sides.corners, FINGER_M + sides.corner_m

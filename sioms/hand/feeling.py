@@ -45,7 +45,7 @@ class Feeling(Motions):
             around.add(known, x, y, direction)
         opened = max(self._goal[3], self._free_m)
         yield from self._move((x, y, direction, opened, *self._goal[4:]))
-        best, found = _NEARLY_RAD, None
+        best, found = _NEARLY, None
         for many in range(self.manner.taps):
             one, first = first or around.next(direction, self._least_m), None
             if one is None:
@@ -60,7 +60,7 @@ class Feeling(Motions):
             if not self._reaches(target):
                 break
             if (yield from self._move(target)):  # it was in the way, and may lie elsewhere now
-                around, best, found = Around(), _NEARLY_RAD, None
+                around, best, found = Around(), _NEARLY, None
                 opened = min(opened + 2.0 * self.manner.clearance_m, self.manner.opening[1] - 1e-3)
             touches: list[Touch] = []
             pushed = None
@@ -71,16 +71,19 @@ class Feeling(Motions):
                     break
             if pushed is not None:  # it is beside that finger, and may lie otherwise now
                 self.say(f"finger {index + 1} pushes what its array does not feel, at {_place(pushed)}: felt anew")
-                around, best, found = Around(), _NEARLY_RAD, None
+                around, best, found = Around(), _NEARLY, None
                 first = Parallel(*pushed, one.direction + 0.5 * math.pi, opened - 2.0 * FINGER_M, math.inf)
                 continue
             if len(touches) < 2:
                 around.missed(one.x, one.y, one.direction)
-            elif (off := _held_by(touches)[0]) < best:
-                best, found = off, _held_by(touches)[1]
             around.add(touches, one.x, one.y, one.direction)
-            if best < FITS_RAD * (1.0 + 0.1 * many):
-                break
+            if len(touches) == 2:
+                off, at = held_by(touches)
+                fits = off < FITS_RAD * (1.0 + 0.1 * many) and around.spare_m(touches) > SPARE_M
+                if (not fits, off) < best:
+                    best, found = (not fits, off), at
+                if fits:
+                    break
         self._around = around
         self.say(f"felt {self.taps - begun} places round it: {'a' if found else 'no'} parallel grasp")
         self.state = before
@@ -220,7 +223,9 @@ class Feeling(Motions):
 
 
 _MIDDLE_RAD = math.radians(74.0)  # of an array
-FITS_RAD, _NEARLY_RAD = math.radians(0.5), math.radians(4.0)
+FITS_RAD, _NEARLY = math.radians(0.5), (True, math.radians(4.0))
+SPARE_M = 1.5e-3
+"""How far from the end of a side a finger that is squeezed feels nothing of it: half the width of a contact at 1 N."""
 _PUSHES_M = 4e-3
 """How far a finger that feels nothing stays behind what is wanted: some 0.06 N on its soft link; free ones 2 mm."""
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
@@ -236,7 +241,7 @@ def _place(at: tuple[float, float]) -> str:
     return f"{1e3 * at[0]:.0f}, {1e3 * at[1]:.0f} mm"
 
 
-def _held_by(touches: Sequence[Touch]) -> tuple[float, tuple[float, float, float]]:
+def held_by(touches: Sequence[Touch]) -> tuple[float, tuple[float, float, float]]:
     """Return the larger friction angle of a grasp on two touches [rad], and x, y, psi of the hand there."""
     (ax, ay), (bx, by) = (
         (one.point[0] + FINGER_M * math.cos(one.normal), one.point[1] + FINGER_M * math.sin(one.normal))

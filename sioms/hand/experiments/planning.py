@@ -14,9 +14,9 @@ import numpy as np
 
 from sioms.hand.around import Around
 from sioms.hand.contacts import FINGER_M, Grasp, classify, grasp_of
-from sioms.hand.feeling import FITS_RAD
+from sioms.hand.feeling import FITS_RAD, SPARE_M, held_by
 from sioms.hand.kinematics import Hand, Six
-from sioms.hand.regrasp import NEUTRAL
+from sioms.hand.regrasp import NEUTRAL, beside
 from sioms.hand.shape import Touch
 from sioms.hand.skills import Skills
 from sioms.hand.touch import Felt, Manner, Reading, Sensed
@@ -73,34 +73,43 @@ def plan_regrasps(subject: Subject, seed: int = 0, steps: int = 2, manner: Manne
     return Planned(tuple(etas), rolls)
 
 
-def feel_round(subject: Subject, pairs: int, seed: int = 0) -> tuple[float, int]:
-    """Touch an object that does not move with one finger at a time, as `Skills` does between grasps.
+def feel_round(subject: Subject, pairs: int, seed: int = 0, regrasps: int = 2) -> tuple[float, int]:
+    """Touch an object that does not move with one finger at a time, as `Skills` does between grasps, and squeeze it.
 
-    Return the true max |eta| [rad] where it would be grasped, and how many pairs of touches that took.
+    Return the true max |eta| [rad] after at most so many regrasps, squeezed, and how many pairs of touches that took.
 
     Args:
         subject: of a draw.
         pairs: at most so many after the first.
         seed: of the noise.
+        regrasps: the first one goes where touches are parallel, each other one as the squeezed fingers tell.
     """
-    object_, around = _Still(subject, seed), Around()
+    object_, around, manner = _Still(subject, seed), Around(), Manner()
     x = y = psi = 0.0
+    best, found, many = (True, math.inf), (0.0, 0.0, 0.0), 0
     for many in range(pairs + 1):
-        pair = object_.tap(x, y, psi)
-        if pair is None:
+        touches = object_.tap(x, y, psi)
+        if not touches:
             around.missed(x, y, psi)
         else:
-            true, held = pair
-            if held.quality < FITS_RAD * (1.0 + 0.1 * many) or many == pairs:
-                return true.quality, many
-            contacts = ((held.contact1, held.normal1), (held.contact2, held.normal2))
-            around.add([Touch(at, normal + math.pi, math.inf, math.inf) for at, normal in contacts], x, y, psi)
-            psi = held.direction
+            off, at = held_by(touches)
+            around.add(touches, x, y, psi)
+            psi = at[2]
+            fits = off < FITS_RAD * (1.0 + 0.1 * many) and around.spare_m(touches) > SPARE_M
+            if (not fits, off) < best:
+                best, found = (not fits, off), at
+            if fits:
+                break
         one = around.next(psi)
         if one is None:
             break
         x, y, psi = one.x, one.y, one.direction
-    return math.inf, pairs
+    held = object_.touch(*found, manner)
+    for _ in range(regrasps - 1):
+        if held is None or held[0].quality < manner.held_rad - 3.0 * _PLACE:
+            break
+        held = object_.touch(*beside(held[1].grasp, held[1].curvatures)[:3], manner)
+    return (math.inf if held is None else held[0].quality), many
 
 
 class _Planner(Skills):
@@ -131,17 +140,18 @@ class _Still:
             return found
         return self._close(x, y, psi, manner.force_n, _BEND)
 
-    def tap(self, x: float, y: float, psi: float) -> tuple[Grasp, Grasp] | None:
-        """Touch with both fingers, one after the other; return the grasp truly and as it is felt."""
+    def tap(self, x: float, y: float, psi: float) -> list[Touch]:
+        """Touch with both fingers, one after the other; return what is felt, nothing where one of them passes."""
         for index, sign in enumerate((-1.0, 1.0)):
             if not self._press(index, x, y, psi, sign, _TAP_N):
-                return None
+                return []
         one, two = self._world.fingers
-        true = grasp_of(one.centre, two.centre, one.phi, two.phi)
         turn, place = self._random.normal(0.0, _TAP_RAD, 2), self._random.normal(0.0, _TAP_M, 4)
         first = one.centre[0] + place[0], one.centre[1] + place[1]
         second = two.centre[0] + place[2], two.centre[1] + place[3]
-        return true, grasp_of(first, second, one.phi + turn[0], two.phi + turn[1])
+        held = grasp_of(first, second, one.phi + turn[0], two.phi + turn[1])
+        contacts = ((held.contact1, held.normal1), (held.contact2, held.normal2))
+        return [Touch(at, normal + math.pi, math.inf, math.inf) for at, normal in contacts]
 
     def _close(self, x: float, y: float, psi: float, force: float, spread: float) -> tuple[Grasp, Sensed] | None:
         for index, sign in enumerate((-1.0, 1.0)):
@@ -155,7 +165,9 @@ class _Still:
         for finger in (one, two):
             bend = 1.0 / finger.radius_m
             spreads.append(spread * (1.0 + bend * FINGER_M) ** 2)
-            bends.append(bend + float(self._random.normal(0.0, spreads[-1])))
+            told = 1.0 / (bend + 1.0 / FINGER_M)  # R, of which a corner's is told to a fifth
+            told *= 1.0 + float(self._random.normal(0.0, min(spreads[-1] * told, 0.2)))
+            bends.append(1.0 / max(told, 1e-6) - 1.0 / FINGER_M)
         places = NEUTRAL - held.eta1, NEUTRAL - held.eta2
         likeness = classify(held.eta1, held.eta2, _PLACE)
         return true, Sensed(held, _PLACE, (bends[0], bends[1]), (spreads[0], spreads[1]), places, force, likeness)

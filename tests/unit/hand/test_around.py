@@ -76,6 +76,17 @@ def test_feeling_round_finds_a_parallel_grasp_of_what_two_touches_do_not_tell(fa
     assert within >= 11, [round(eta / DEG, 2) for eta, _ in found]
 
 
+def test_how_far_touches_are_from_the_ends_of_their_sides() -> None:
+    around = Around()
+    around.add(rounded_square(20.0, 2.0), 0.0, 0.0, 0.0)
+    low, high = touch(20.0, -17.0, 0.0), touch(-20.0, 15.0, 180.0)
+    around.add([low], 0.0, 0.0, 0.0)
+    around.add([high], 0.0, 0.0, 0.0)
+    assert around.spare_m([low]) == pytest.approx(1 * MM, abs=1e-6)  # of the straight part, up to 18 mm
+    assert around.spare_m([high]) == pytest.approx(3 * MM, abs=1e-6)
+    assert around.spare_m([low, high]) == pytest.approx(1 * MM, abs=1e-6) and around.spare_m([]) == math.inf
+
+
 @pytest.mark.parametrize("half_mm", [-10.0, 0.1, 0.6], ids=["moved by the first touch", "a foil", "a sheet"])
 def test_touches_that_leave_nothing_between_them_are_no_error(half_mm: float) -> None:
     around = Around()
