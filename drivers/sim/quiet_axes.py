@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from sioms.motion.plan_step import all_idle
 from sioms.plant.binary import beams_record
 from sioms.plant.motor_step import Motors
 from sioms.plant.stepper_step import Steppers
@@ -63,7 +64,7 @@ class QuietAxes:
                 self._beams.before[coordinate] = position
         record.ahead, record.last_ns, record.found = world.ahead, world.last_ns, 0
         record.still = world.is_still
-        record.plain, record.idle = not world.has_effects, world.bank.is_idle(world.all)
+        record.plain, record.idle = not world.has_effects, all_idle(world.bank.plans)
         record.may_rest = not watched and record.plain
         return True
 

@@ -39,7 +39,7 @@ class Pace:
 
     def begin_tick(self, dt: float) -> None:
         """A tick begins, dt after the last [s]: further commands may begin."""
-        self._begun[:] = 0
+        self._begun.fill(0)
         self._pieces = PIECES + int(PIECES * dt / self._tick_s)
         self._spare = self._spare_a_tick
 
