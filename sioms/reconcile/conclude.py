@@ -67,7 +67,7 @@ HELD = (
 )
 #: What another drive is called among the alternatives, and what is said of it.
 OTHER_LAW = "another_law_of_the_drive"
-OF_DRIVE = "{} leaves what is no noise between measured and commanded force: another law of the drive may be meant"
+OF_DRIVE = "measured and commanded force do not tell {} from another law of the drive"
 #: Steps of the last fit.
 LAST = 12
 #: The effect that another sample time looks like.

@@ -17,6 +17,7 @@ from scipy.signal import lfilter, ss2tf
 from sioms.reconcile.effect import Array
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.stale import news
 
 #: Relative drive noise assumed where no force was measured; refined from the innovations afterwards.
 DRIVE_NOISE_DEFAULT = 0.004
@@ -158,7 +159,7 @@ def drive_noise(
     found = []
     for r in session.records:
         if r.force_measured is not None:
-            second = np.diff(r.force_measured - delivered(r), 2)
+            second = np.diff((r.force_measured - delivered(r))[news(r.force_measured).rows], 2)
             found.append(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
     floor = 1e-4 * rated_force
     return float(max(np.median(found), floor)) if found else DRIVE_NOISE_DEFAULT * rated_force
