@@ -21,7 +21,7 @@ import numpy as np
 from sioms.reconcile import rules
 from sioms.reconcile.blocks import better
 from sioms.reconcile.bounces import rattles
-from sioms.reconcile.effect import Slot
+from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
 from sioms.reconcile.noise import effective_samples
@@ -89,25 +89,32 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
             *_for_several(searcher, found),
         ]
     )
+    if rattles(model):
+        return closest
     return [
-        replace(r, told=told) if r.missed_little and r.allowed < ALIKE and (told := _told(searcher, found, r)) else r
+        replace(r, told=told(found.fit, found.losses, r.fit, searcher.loss(r.fit)))
+        if r.missed_little and r.allowed < ALIKE and not rattles(r.fit.model)
+        else r
         for r in closest
     ]
 
 
-def _told(searcher: Searcher, found: Found, r: Rival) -> str:
-    """Say how a rival is told by its remains from a model that comes down to the noise; empty: it is not."""
-    fit = found.fit
-    if rattles(fit.model) or rattles(r.fit.model) or fit.ratio > LOUD or r.excess < FAR_WORSE:
+def told(mine: Fit, losses: Array, other: Fit, others: Array) -> str:
+    """Say how a rival is told by its remains from a model that comes down to the noise; empty: it is not.
+
+    Args:
+        losses, others: of both, held out, of each block of time.
+    """
+    far = float(np.sum(other.residual**2)) > (1.0 + FAR_WORSE) * float(np.sum(mine.residual**2))
+    if mine.ratio > LOUD or not far or len(losses) < FEWEST:
         return ""
-    per_row = effective_samples(fit.residual) / len(fit.residual)
-    likelier = 0.5 * per_row * (searcher.loss(r.fit) - found.losses) / fit.ratio**2
-    share = float(np.mean(likelier > EACH_BLOCK))
-    if share < NEARLY_EACH or len(likelier) < FEWEST:
+    per_row = effective_samples(mine.residual) / len(mine.residual)
+    share = float(np.mean(0.5 * per_row * (others - losses) / mine.ratio**2 > EACH_BLOCK))
+    if share < NEARLY_EACH:
         return ""
     return (
-        f"leaves {r.fit.ratio / fit.ratio:.2g} times as much as what is named, which is told in {100 * share:.0f} % of "
-        f"{len(likelier)} blocks of time"
+        f"leaves {other.ratio / mine.ratio:.2g} times as much as what is named, which is told in {100 * share:.0f} % "
+        f"of {len(losses)} blocks of time"
     )
 
 

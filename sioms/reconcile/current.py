@@ -247,9 +247,9 @@ def _of_command(records: list[_Seen], left: Array) -> float:
 
     def seen(r: _Seen) -> Array:
         past = {k: np.concatenate([np.zeros(k), r.record.force])[r.rows] for k in range(LONGEST_PAST)}
-        bent = [f(past[k]) for k in PAST for f in (np.abs, lambda p: p * np.abs(p))]
+        bent = [p for k in PAST for p in (np.abs(past[k]), past[k] * np.abs(past[k]))]
         steps = [past[k] - past[k + n] for n, first in STEPS.items() for k in first]
-        steep = [f(s) for s in steps for f in (lambda s: s * np.abs(s), lambda s: s**3)]
+        steep = [p for s in steps for p in (s * np.abs(s), s**3)]
         return np.stack([*(past[k] for k in (*PAST, *BETWEEN)), *bent, *steep], axis=1)
 
     columns = np.concatenate([seen(r) for r in records])
@@ -343,7 +343,8 @@ def _latest(records: list[_Seen], limits: Law, dt: float) -> _Late:
             below = min(step, value)
             slopes.append((off({**values, name: value + step}) - off({**values, name: value - below})) / (step + below))
         size = np.array([max(float(np.linalg.norm(s)), 1e-300) for s in slopes])
-        gram = np.stack(slopes / size[:, None]) @ np.stack(slopes / size[:, None]).T
+        unit = np.stack(slopes) / size[:, None]
+        gram = unit @ unit.T
         errors = np.sqrt(np.maximum(np.diag(np.linalg.pinv(gram)), 0.0) * float(e @ e) / rows) / size
         named = dict(zip(values, map(float, errors), strict=True))
         return _Late(values, named, float(e @ e), others, none, rows)
@@ -361,15 +362,11 @@ def _latest(records: list[_Seen], limits: Law, dt: float) -> _Late:
     if not best.counts(dt):
         return best
     start = 0.5 * np.array([max(found[n], STEP * dt) for n in ("delay", "lag")]) / dt
-    at = (
-        dt
-        * minimize(
-            lambda p: misfit({"delay": p[0] * dt, "lag": p[1] * dt}),
-            start,
-            method="Nelder-Mead",
-            options={"maxiter": 150},
-        ).x
-    )
+
+    def at_once(p: Array) -> float:
+        return misfit({"delay": float(p[0]) * dt, "lag": float(p[1]) * dt})
+
+    at = dt * np.asarray(minimize(at_once, start, method="Nelder-Mead", options={"maxiter": 150}).x)
     if np.min(at) > 0.0:
         both = law({"delay": float(at[0]), "lag": float(at[1])}, {f"{n} alone": v for n, v in left.items()})
         if both.counts(dt) and both.told_from(best.left):

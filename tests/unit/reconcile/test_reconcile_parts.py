@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
-from sioms.reconcile.ambiguity import lookalikes, settle
+from sioms.reconcile.ambiguity import lookalikes, settle, told
 from sioms.reconcile.blocks import better, formal, heldout, intervals
 from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import index_fit, lattice
@@ -24,7 +25,7 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.evidence import spans_of
 from sioms.reconcile.excitation import common, gate
 from sioms.reconcile.experiment import Envelope, catalogue, demands, one_speed, repeated, separate
-from sioms.reconcile.fit import LEFT, Problem, block_ids, free_parameters, jacobian, refit
+from sioms.reconcile.fit import LEFT, Fit, Problem, block_ids, free_parameters, jacobian, refit
 from sioms.reconcile.locate import locate
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
@@ -657,3 +658,25 @@ def test_trials_that_overflow_are_quiet_in_every_thread() -> None:
         warnings.simplefilter("error")
         leaves = list(quiet(pool.map)(lambda times: huge * times - huge * times, [1.0, 1e10]))
     assert leaves[0] == 0.0 and np.isnan(leaves[1])
+
+
+def test_a_rival_is_told_by_every_block_or_stays() -> None:
+    """Of two models that differ by as much in all, one differs everywhere, the other in a few turns."""
+    rng = np.random.default_rng(1)
+    noise, blocks = rng.standard_normal(4000), np.repeat(np.arange(40), 100)
+    everywhere = 5.0 * np.sin(2.0 * np.pi * np.arange(4000) / 50.0)
+    seldom = np.where(blocks % 8 == 0, np.sqrt(8.0) * everywhere, 0.0)
+
+    def fit(residual: np.ndarray) -> Fit:
+        return Fit(AXIS, (), residual, np.empty((len(residual), 0)))
+
+    def says(mine: np.ndarray, off: np.ndarray) -> str:
+        losses, others = (np.bincount(blocks, weights=r**2) for r in (mine, mine + off))
+        return told(fit(mine), losses, fit(mine + off), others)
+
+    slow = lfilter([np.sqrt(1.0 - 0.99**2)], [1.0, -0.99], rng.standard_normal(4000))
+    assert "of 40 blocks" in says(noise, everywhere)
+    assert not says(noise, seldom)
+    assert not says(noise, 0.5 * everywhere), "less than all that is left could be a part of it"
+    assert not says(1.5 * noise, 2.0 * everywhere), "what is named is above the noise"
+    assert not says(slow, everywhere), "a block of slow noise is one sample, or less"
