@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import functools
 import json
 import os
 import select
@@ -235,30 +236,44 @@ def test_what_was_written_before_a_reset_is_not_carried_out_by_a_mount_that_is_h
     daemon: Daemon, axis: sioms.AxisNode
 ) -> None:
     """It stands still for less than its lease, in which somebody writes, and somebody else stops and resets all."""
+    ends: list[int | None] = []
     with Mount(daemon.socket, "--lease", "5") as mount, daemon.cell() as cell:
-        fd = os.open(mount.folder / "mod0/xaxis", os.O_WRONLY | os.O_NONBLOCK)
-        try:
-            os.write(fd, b"velocity=0.2\n")
-            wait_for(lambda: axis.read().commanded_velocity[0] == pytest.approx(0.2), "motion")
-            for held_s in (0.03, 0.06):
-                time.sleep(0.3)  # nothing waits still from the last time
+        while ends.count(errno.ECANCELED) < 2:
+            time.sleep(0.3)  # nothing of the last time may still be waiting
+            fd = os.open(mount.folder / "mod0/xaxis", os.O_WRONLY | os.O_NONBLOCK)
+            try:
+                os.write(fd, b"velocity=0.2\n")
+                wait_for(lambda: axis.read().commanded_velocity[0] == pytest.approx(0.2), "motion")
                 os.kill(mount.process.pid, signal.SIGSTOP)
-                late = Waiting(lambda: os.write(fd, b"velocity=0.2\n"))
-                time.sleep(held_s)
+                late = Waiting(functools.partial(os.write, fd, b"velocity=0.2\n"))
+                time.sleep(0.03)
                 cell.emergency_stop()
                 cell.reset()
                 os.kill(mount.process.pid, signal.SIGCONT)
-                assert late.errno() == errno.ECANCELED, (held_s, (mount.folder / ".log").read_text())
+                ends.append(late.errno())
                 wait_for(lambda: axis.read().commanded_velocity[0] == 0.0, "rest")
-                assert "sent before the last reset" in (mount.folder / ".log").read_text()
-            time.sleep(0.3)
-            os.write(fd, b"velocity=0.2\n")
-            wait_for(lambda: axis.read().commanded_velocity[0] == pytest.approx(0.2), "motion")
-            cell.emergency_stop()
-            cell.reset()
-            os.write(fd, b"velocity=0.2\n")  # at once, as it has not been held up
+            finally:
+                os.close(fd)
+            # On a busy machine it may have stood still for so long that what it holds has been taken away from it.
+            assert ends[-1] in (errno.ECANCELED, errno.ETIMEDOUT) and len(ends) < 9, ends
+        assert "sent before the last reset" in (mount.folder / ".log").read_text()
+
+
+def test_a_mount_that_is_not_held_up_passes_on_what_is_written_right_behind_a_reset(
+    daemon: Daemon, files: Path, axis: sioms.AxisNode
+) -> None:
+    with daemon.cell() as cell:
+        fd = os.open(files / "mod0/xaxis", os.O_WRONLY | os.O_NONBLOCK)
+        try:
+            for _ in range(20):
+                cell.emergency_stop()
+                cell.reset()
+                with contextlib.suppress(OSError):  # a busy machine holds it up now and then
+                    os.write(fd, b"velocity=0.2\n")
+                    return
         finally:
             os.close(fd)
+    raise AssertionError("all were refused")
 
 
 def test_a_mount_outlives_its_daemon(start_daemon: Callable[..., Daemon]) -> None:
