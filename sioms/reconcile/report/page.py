@@ -13,6 +13,7 @@ from sioms.reconcile.report.words import (
     columns,
     groups,
     headline,
+    held_already,
     in_words,
     number,
     places,
@@ -149,7 +150,7 @@ def _where(v: Verdict) -> str:
 def _what(p: Page, v: Verdict) -> None:
     """Lay out what is missing: effects by name, candidates for one place, and what only describes the remainder."""
     if v.effects:
-        p.head("Candidates" if v.alternatives else "What was missing")
+        p.head("Candidates" if v.alternatives else "What the model holds" if held_already(v) else "What was missing")
         _numbers(p, v.effects)
     if v.alternatives:
         p.text(

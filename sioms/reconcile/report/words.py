@@ -23,8 +23,27 @@ LINES = 10
 CHANCE = 0.05
 
 
+HELD_ALREADY = {
+    Outcome.NAMED: "Nothing is missing beside what the model holds already, which these records confirm.",
+    Outcome.AMBIGUOUS: "Nothing is missing, but these records cannot tell what the model holds already from others.",
+}
+#: The model as given is as good as the corrected one up to this multiple of its error.
+AS_GOOD = 1.1
+
+
+def held_already(v: Verdict) -> bool:
+    """Say whether all that was found stood in the nominal model already, whose error is as small as that of the
+    corrected one.
+    """
+    found = {e.name for e in v.effects}
+    as_good = v.speaking.before <= AS_GOOD * v.speaking.after
+    return bool(found) and v.outcome in HELD_ALREADY and found <= set(v.nominal.effects) and as_good
+
+
 def headline(v: Verdict) -> str:
     """One sentence."""
+    if held_already(v):
+        return HELD_ALREADY[v.outcome]
     if v.outcome is Outcome.UNEXPLAINED and v.effects:
         return "Part of what the model lacks has been identified; no effect of the library explains the rest."
     if v.candidates:
@@ -45,6 +64,8 @@ def sureness(v: Verdict) -> str:
             still = ", ".join(t for e in v.effects for n in e.open if (t := v.title(n)))
             rest = f"not ruled out: {still}" if still else "what could stand in its place is ruled out"
             return f"How sure: {left}; {rest}."
+        case Outcome.AMBIGUOUS if held_already(v):
+            return f"How sure: {left}; each of the candidates explains it."
         case Outcome.AMBIGUOUS:
             return f"How sure: something is missing, and each of the candidates explains it; {left}."
     known = "what has a name is sure as far as its evidence goes; the rest" if v.effects else "what it is"

@@ -18,6 +18,7 @@ from sioms.reconcile.model import AxisModel
 from sioms.reconcile.model_file import parse_model, write_model
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.report.page import page
+from sioms.reconcile.report.words import headline
 from sioms.reconcile.twin import from_files
 from sioms.reconcile.verdict import Outcome
 
@@ -102,6 +103,11 @@ def test_the_report_on_a_rig_has_the_words_of_a_rig(tmp_path: Path) -> None:
     verdict = reconcile.analyse(moved(lambda x, v, a: 40.0 * v, 12), RIG)
     page(verdict, 1.0, draw=False).write(tmp_path / "report.html")
     html = (tmp_path / "report.html").read_text()
+    assert "What the model lacks has been identified" in html
+    again = reconcile.analyse(moved(lambda x, v, a: 40.0 * v, 13), verdict.model)
+    assert again.outcome is Outcome.NAMED and headline(again).startswith(
+        "Nothing is missing beside what the model holds"
+    )
     for foreign in ("closed loop", "controller", "pitch", "motor", "encoder zero", "drive"):
         assert foreign not in html, foreign
     assert "of the force that the motion takes" in html
