@@ -68,6 +68,7 @@ HELD = (
 #: What another drive is called among the alternatives, and what is said of it.
 OTHER_LAW = "another_law_of_the_drive"
 OF_DRIVE = "measured and commanded force do not tell {} from another law of the drive"
+TO_TELL = "{} would be told from {} by {}, with less noise of the force"
 #: Steps of the last fit.
 LAST = 12
 #: The effect that another sample time looks like.
@@ -165,6 +166,11 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     if blindly:
         found_here = [_rated(e, nominal, fit.model) for e in found_here]
     open_now = open_rivals if said is Outcome.AMBIGUOUS else []
+    if nominal.imposed:  # no command is designed for a rig
+        notes += [
+            TO_TELL.format(*(known()[n].title for n in (r.effect, r.rival)), known()[r.rival].separate)
+            for r in open_now
+        ]
     searched_for = [e for e in found_here if e.name not in s.searcher.frozen]
     # beside a gap the remainder is of bounces, which no other effect can be
     doubtful = [] if rattles(found.fit.model) else [e.name for e in searched_for if doubted(e, ratio)]

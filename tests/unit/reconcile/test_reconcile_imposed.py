@@ -113,6 +113,17 @@ def test_the_report_on_a_rig_has_the_words_of_a_rig(tmp_path: Path) -> None:
     assert "of the force that the motion takes" in html
 
 
+def test_what_noise_hides_is_asked_for() -> None:
+    rng = np.random.default_rng(5)
+    quiet = moved(lambda x, v, a: 3.0 * np.sign(v) + 20.0 * v, 7)
+    noisy = tuple(replace(r, force=r.force + 1.2 * rng.standard_normal(len(r))) for r in quiet.records)
+    verdict = reconcile.analyse(Session(noisy), RIG)
+    assert verdict.outcome is Outcome.AMBIGUOUS and verdict.alternatives == (("power_drag",),)
+    assert any(
+        "would be told from drag with a power of the speed by cruise at several speeds" in n for n in verdict.notes
+    )
+
+
 def test_a_damper_that_is_as_stated_lacks_nothing() -> None:
     verdict = reconcile.analyse(moved(lambda x, v, a: 40.0 * v, 12), replace(RIG, viscous=40.0))
     assert verdict.outcome is Outcome.NONE
