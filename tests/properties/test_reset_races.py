@@ -83,7 +83,8 @@ def meetings(
 
     Args:
         before, inside, act: what has happened before, what is interrupted, and by what.
-        dies: the daemon dies when the reset stands in the latch.
+        dies: who is interrupted dies: the daemon when the reset stands in the latch, the driver when it has said that
+            it has obeyed.
     """
     for place in itertools.count():
         with cells() as make, pytest.MonkeyPatch.context() as patch:
@@ -99,7 +100,9 @@ def meetings(
                 patch.setattr(Timestamps, "monotonic_ns", lambda *_, sent_ns=sent_ns: sent_ns)
             mine = cell.server.cell.shared.latch if inside == "reset" else cell._process(AXIS).runtime.latch
             if dies:
-                patch.setattr(mine, "reset", functools.partial(_die_after, mine.reset))
+                who: Any = mine if inside == "reset" else cell._process(AXIS).runtime.stops._request
+                last = "reset" if inside == "reset" else "take"
+                patch.setattr(who, last, functools.partial(_die_after, getattr(who, last)))
             answer = ""
             with interrupted(mine, place, functools.partial(act, cell)) as left, suppress(Died):
                 answer = cell.reset(RESETTER) if inside == "reset" else cell.tick(AXIS) or ""
@@ -140,7 +143,7 @@ def test_a_request_that_a_reset_has_answered_stops_no_later_daemon(goes_on: bool
             CLOCK.now_ns += 20_000_000
             assert cell.take(action) != "refused"
 
-    for cell, place, _ in meetings([("request_stop", STOPPER)], "tick", act):
+    for cell, place, _ in meetings([("request_stop", STOPPER)], "tick", act, dies=not goes_on):
         if goes_on:
             cell.take(("tick", AXIS))
         cell.take(("crash",))
