@@ -72,6 +72,7 @@ def serve(config_path: str, given_path: str | None, level: str, process: ForkSer
     try:
         loop.run()
     finally:
+        server.stops.look()  # who has asked since the last look
         server.cell.shared.files.remove()
         record.close()
         listening.close()

@@ -5,13 +5,15 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+from contextlib import suppress
 
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import TABLE_SIZE, MarkerTable
 from sioms.protocol.stopfile import StopRequest
+from sioms.protocol.stopjournal import workcell_entry
 
 from .journals import OwnJournal
-from .stop_files import StopFiles
+from .stop_files import StopFiles, unheard
 from .stop_record import StopRecord
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
@@ -33,13 +35,17 @@ class Shared:
     def __init__(self, path: str, record: StopRecord) -> None:
         self.record = record
         self.journal = OwnJournal()
+        word, source = unheard(path)
+        if word and word != record.state.request:  # who is late says that he has obeyed the one before
+            with suppress(OSError):  # it holds for our life then
+                record.note(workcell_entry(source, stop=True, named=True, resets=record.state.resets))
         self.files = StopFiles(path)
         latch_fd, latch = _memory("sioms-latch", LATCH_SIZE)
         markers_fd, markers = _memory("sioms-markers", TABLE_SIZE)
         self.fds = [latch_fd, self.files.fd, self.files.taken_fd, markers_fd, record.drivers_fd]
         self.latch = Latch(latch)
         self.request = StopRequest(self.files.fd, self.files.taken_fd)
-        self.latch.begin(record.state.resets, self.request.mark)
+        self.latch.begin(record.state.resets, (0, self.request.mark[1]))  # somebody may have written by now
         self.markers = MarkerTable(markers)
 
 

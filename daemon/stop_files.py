@@ -35,13 +35,10 @@ class StopFiles:
         fd: of the request file, for the daemon and the drivers.
         taken_fd: of the file that says which request has been taken, for the same.
         client_fds: the two for clients that may stop: to write the one, to read the other.
-        unheard: word of the last stop that was asked for of which nobody has said that it was obeyed, and who asked; 0:
-            there is none.
     """
 
     def __init__(self, path: str) -> None:
         self._path = path
-        self.unheard = _unheard(path)
         self.remove()
         self.fd = self._make(path + REQUEST, 0o600)
         self.taken_fd = self._make(path + TAKEN, 0o644)
@@ -90,8 +87,10 @@ class StopFiles:
                 os.unlink(self._path + end)
 
 
-def _unheard(path: str) -> tuple[int, str]:
-    """Return what was written to files left by another daemon and has not been heard, and by whom."""
+def unheard(path: str) -> tuple[int, str]:
+    """Return the word of the last stop that was asked for by files which another daemon has left, if nobody has said
+    that he has obeyed it, and who asked; 0: there is none.
+    """
     fds: list[int] = []
     try:
         for end in (REQUEST, TAKEN):
@@ -102,7 +101,8 @@ def _unheard(path: str) -> tuple[int, str]:
         request = StopRequest(fds[0], os.dup(fds[1]))
         fds.pop(0)
         word = request.mark[0]
-        return (word, request.source) if word and not request.taken(word) else (0, "")
+        # Of a later word nobody has said so either: that may be of before a restart of the machine.
+        return (word, request.source) if word not in (0, request.obeyed) else (0, "")
     except FileNotFoundError:
         return 0, ""
     finally:

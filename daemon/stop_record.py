@@ -120,6 +120,7 @@ class StopRecord:
 
     def close(self) -> None:
         """Close the file, and take it away when nothing is stopped."""
+        self.look()  # drivers may have noted something at their end
         self._flusher.end()
         if not self.state.workcell and not self.state.parts:
             os.unlink(self.path)

@@ -33,7 +33,7 @@ class Stops:
     def __init__(self, cell: Cell) -> None:
         self._cell = cell
         self._shared = cell.shared
-        self._request_seen = self._shared.request.mark
+        self._request_seen = self._shared.latch.answered_request
 
     def restore(self) -> None:
         """Be stopped from the beginning when it was so at the end."""
@@ -44,9 +44,6 @@ class Stops:
             self._cell.log("warning", "still stopped", source=self._shared.latch.source)
         for node, source in stopped.nodes():
             self._cell.log("warning", "still stopped", node=node, source=source)
-        word, source = self._shared.files.unheard
-        if word and word != stopped.request:  # a driver that was late may have said that it has obeyed the one before
-            self.stop_workcell(source)
 
     def stop_workcell(self, source: str, by: int = 0, asked_ns: int = 0) -> None:
         """Latch the emergency stop, wake every driver, and keep it.
@@ -98,7 +95,8 @@ class Stops:
         clients write one ahead, for the drivers, in case that we hang.
         """
         request = self._shared.request
-        is_same, mark = request.pid == pid, request.mark
+        mark = request.mark
+        is_same = request.pid == pid and request.mark == mark  # else somebody is just writing
         if is_same:
             self._request_seen = mark
         else:
@@ -115,11 +113,15 @@ class Stops:
             sent_ns: when that was sent, at the earliest [ns, CLOCK_MONOTONIC].
             by: number of the session.
         """
-        latch, answered = self._shared.latch, self._request_seen
+        latch, record, answered = self._shared.latch, self._shared.record, self._request_seen
         word = answered[0] if answered[0] <= time.monotonic_ns() else 0  # anybody can write any
+        record.look()
+        noted = record.state.requested
+        if self._shared.request.mark == answered:  # then what drivers have read there was before it, whatever its word
+            word = max(word, noted)
         entry = workcell_entry(who, stop=False, resets=latch.resets + 1, request=word)
         self._note(entry)  # first: a later stop is noted after it
-        sent_ns = max(sent_ns, self._shared.record.asked.own_of_any_ns(by))
+        sent_ns = max(sent_ns, record.asked.own_of_any_ns(by))
         latch.reset(time.monotonic_ns(), answered, sent_ns)
         self._cell.log("warning", "reset", by=who)
         self.hear_request()  # what has been asked for since

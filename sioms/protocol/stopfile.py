@@ -92,9 +92,14 @@ class StopRequest:
         """Say that a request has been obeyed."""
         os.pwrite(self._taken_fd, _WORD.pack(mark[0]), 0)
 
+    @property
+    def obeyed(self) -> int:
+        """Word of the request of which somebody has said last that he has obeyed it."""
+        return int.from_bytes(os.pread(self._taken_fd, 8, 0), "little")
+
     def taken(self, word: int) -> bool:
         """Tell whether a request, or a later one, has been obeyed."""
-        return int.from_bytes(os.pread(self._taken_fd, 8, 0), "little") >= word
+        return self.obeyed >= word
 
     def close(self) -> None:
         """Close both descriptors."""

@@ -259,3 +259,21 @@ def braking(seen: Any, after: int) -> int:
         if status & STOPPED or not status & AxisStatus.MOVING:
             return int(reading.stamp_ns)
     return 0
+
+
+def test_a_reset_answers_every_request_before_the_one_that_is_there(daemon: Daemon) -> None:
+    """Who asks for a stop may be held up between looking at the clock and writing: somebody else's word is later."""
+    request = open_stop_request(daemon.socket)
+    assert request is not None
+    with contextlib.closing(request), daemon.cell() as cell:
+        later = request.request(time.monotonic_ns(), os.getpid(), "the first that is written")
+        wait_for(lambda: cell.status()["stopped_ns"], "the first is heard")
+        cell.emergency_stop(why="stopped in any case")
+        first = request.request(time.monotonic_ns(), os.getpid(), "smoke")
+        wait_for(lambda: request.taken(first), "it is heard")
+        time.sleep(0.1)
+        request.request(later - 1, os.getpid(), "held up")
+        time.sleep(0.1)
+        cell.reset()
+        time.sleep(0.1)
+        assert not cell.status()["stopped_ns"], "a reset that has been acknowledged"

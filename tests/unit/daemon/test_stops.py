@@ -15,13 +15,15 @@ from sioms.daemon import requests as requests_module
 from sioms.daemon.cell import Cell
 from sioms.daemon.log import Log
 from sioms.daemon.requests import Requests
+from sioms.daemon.shared import Shared
+from sioms.daemon.stop_files import StopFiles
 from sioms.daemon.stop_record import StopRecord
 from sioms.daemon.stops import Stops
 from sioms.part_times import PartTimes
 from sioms.protocol import verbs
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.stopfile import SOMEBODY, StopRequest
-from sioms.protocol.stopjournal import StopJournal, node_entry
+from sioms.protocol.stopjournal import StopJournal, node_entry, workcell_entry
 
 PID = 4711
 
@@ -33,6 +35,7 @@ class Rig:
         self.fds = [os.memfd_create(name) for name in ("stop", "stopped")]
         self.request = StopRequest(*self.fds)
         self.latch = Latch(memoryview(bytearray(LATCH_SIZE)))
+        self.latch.begin(0, self.request.mark)
         self.noted: list[str] = []
         state = SimpleNamespace(workcell="")
         record = SimpleNamespace(look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes())
@@ -199,3 +202,69 @@ def test_what_lay_in_a_socket_before_it_was_stamped_is_as_old_as_can_be() -> Non
         for _ in range(3):
             Requests.receive(requests, session)  # type: ignore[arg-type]
     assert served == [0, 0, 77]
+
+
+def test_a_stop_asked_for_by_two_at_the_same_time_is_each_ones(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Somebody else writes while the daemon looks whose the request is."""
+    rig.request.request(1000, PID, "enough")
+    look, looks = os.pread, []
+
+    def pread(*arguments: int) -> bytes:
+        found = look(*arguments)
+        looks.append(arguments)
+        if len(looks) == 2:
+            rig.request.request(1001, PID + 1, "fire")
+        return found
+
+    monkeypatch.setattr(os, "pread", pread)
+    rig.stops.stop_for(PID, "eva: enough")
+    assert any("fire" in each for each in rig.noted) and rig.noted[-1] == "eva: enough"
+
+
+def files(path: Path) -> StopRequest:
+    """Leave the stop files of a daemon that has been killed."""
+    made = StopFiles(str(path))
+    return StopRequest(made.fd, made.taken_fd)
+
+
+@pytest.mark.parametrize("obeyed", [0, 5000])
+def test_a_daemon_that_dies_at_its_start_loses_no_stop_that_nobody_has_heard(tmp_path: Path, obeyed: int) -> None:
+    """Neither one of which a later word is said to have been obeyed, as from before the machine was started again."""
+    left = files(tmp_path / "sioms")
+    left.take((obeyed, 0))
+    left.request(1000, PID, "fire")
+    record = StopRecord(str(tmp_path / "stops"))
+    Shared(str(tmp_path / "sioms"), record)
+    record._flusher.end()
+    os.close(record._fd)  # it dies
+    again = StopRecord(str(tmp_path / "stops"))
+    assert "fire" in again.state.workcell
+    Shared(str(tmp_path / "sioms"), again)
+    again.note(workcell_entry("ann", stop=False, resets=1))
+    again.close()
+    assert not (tmp_path / "stops").exists()
+
+
+def test_who_asks_while_the_files_are_made_is_heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = StopFiles.__init__
+
+    def made(self: StopFiles, path: str) -> None:
+        begin(self, path)
+        StopRequest(os.dup(self.fd), os.dup(self.taken_fd)).request(1000, PID, "fire")
+
+    monkeypatch.setattr(StopFiles, "__init__", made)
+    record = StopRecord(str(tmp_path / "stops"))
+    shared = Shared(str(tmp_path / "sioms"), record)
+    assert shared.request.mark != shared.latch.answered_request, "what drivers look at"
+    cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
+    assert "fire" in Stops(cell).hear_request() and "fire" in record.state.workcell
+    record.close()
+
+
+def test_a_stop_that_a_driver_notes_at_the_end_of_the_daemon_is_kept(tmp_path: Path) -> None:
+    record = StopRecord(str(tmp_path / "stops"))
+    StopJournal(os.dup(record.drivers_fd)).append(workcell_entry("pid 7: fire", stop=True, request=1000), 1.0)
+    record.close()
+    again = StopRecord(str(tmp_path / "stops"))
+    assert "fire" in again.state.workcell
+    again.close()
