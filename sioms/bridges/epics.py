@@ -16,10 +16,12 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, TypeAlias
+from zlib import crc32
 
 from p4p.nt import NTScalar
 from p4p.server import Server, StaticProvider
 from p4p.server.thread import SharedPV
+from p4p.util import ThreadedWorkQueue
 
 from sioms.arguments import place, positive
 from sioms.bridges.leases import LEASE_S, Leases
@@ -37,6 +39,8 @@ ASK_S = 0.5
 SHOWN_S = 0.5
 """Longest time that a put waits for a look that is under way, before it is answered without being shown [s]."""
 GONE = "cannot be read"
+QUEUES = 4
+"""Of puts, each with a thread, and as many threads for stops."""
 Act: TypeAlias = Callable[[float, str, str], None]
 _NUMBER, _WHOLE, _TEXT = NTScalar("d", display=True, control=True), NTScalar("l", display=True), NTScalar("s")
 
@@ -118,19 +122,43 @@ def serve(provider: StaticProvider, host: str, port: int) -> Server:
     return server
 
 
+class Puts:
+    """A queue for puts, as the library wants one: what waits there behind a put to a driver that hangs came before.
+
+    Args:
+        prompt: tells when a put has come.
+        workers: threads; with one, puts are done in their order.
+    """
+
+    def __init__(self, prompt: Prompt, workers: int = 1) -> None:
+        self._prompt = prompt
+        self._queue = ThreadedWorkQueue("puts", workers, daemon=True, maxsize=0).start()
+
+    def push(self, put: Callable[[], None]) -> None:
+        """Have a put done that has come now (called in a thread of the library)."""
+        came_ns = self._prompt.came_ns()
+
+        def done() -> None:
+            with self._prompt.word(came_ns):
+                put()
+
+        self._queue.push(done)
+
+
 class Shown:
     """One process variable.
 
     Args:
         kind: type of its value.
         channel: whose units, limits and description clients see.
+        puts: where they wait.
         act: what a put does, with the value, and account and address of the client; None: nothing can be put.
     """
 
-    def __init__(self, kind: NTScalar, channel: ChannelInfo, act: Act | None = None) -> None:
+    def __init__(self, kind: NTScalar, channel: ChannelInfo, puts: Puts, act: Act | None = None) -> None:
         self._kind, self._channel, self._act = kind, channel, act
         self._last: tuple[str, int, str] | None = None
-        self.pv = SharedPV(nt=kind, handler=self)
+        self.pv = SharedPV(nt=kind, handler=self, queue=puts)
 
     def put(self, pv: SharedPV, op: Any) -> None:
         """Carry out a put of a client (called in a thread of the library)."""
@@ -232,7 +260,8 @@ class Bridge:
     """
 
     def __init__(self, prefix: str, putters: Putters, prompt: Prompt, leases: Leases | None = None) -> None:
-        self._leases, self._putters, self._prompt = leases, putters, prompt
+        self._leases, self._putters = leases, putters
+        self._puts, self._stop_puts = [Puts(prompt) for _ in range(QUEUES)], Puts(prompt, QUEUES)
         self.provider = StaticProvider("sioms")
         self._prefix = prefix
         self._shown: dict[str, Shown] = {}
@@ -337,8 +366,7 @@ class Bridge:
 
         def judged(value: float, account: str, peer: str) -> None:
             self._putters.judge(peer, stops=stops)
-            with self._prompt.word():
-                act(value, f"{printable(account, 32)}@{peer}")
+            act(value, f"{printable(account, 32)}@{peer}")
             if self._lock.acquire(timeout=SHOWN_S):
                 try:
                     self._show(node)
@@ -349,11 +377,12 @@ class Bridge:
 
         return judged
 
-    def _post(self, node: str, what: str, *words: Any) -> Shown:
-        """Return the variable of a name, made where there is none yet."""
+    def _post(self, node: str, what: str, kind: NTScalar, channel: ChannelInfo, act: Act | None = None) -> Shown:
+        """Return the variable of a name, made where there is none yet; no move is before a stop in its queue."""
         name = f"{self._prefix}{node}{what}"
         if name not in self._shown:
-            self._shown[name] = Shown(*words)
+            puts = self._stop_puts if what.endswith(".STOP") else self._puts[crc32(node.encode()) % QUEUES]
+            self._shown[name] = Shown(kind, channel, puts, act)
             self._of_node.setdefault(node, set()).add(name)
             self.provider.add(name, self._shown[name].pv)
         return self._shown[name]

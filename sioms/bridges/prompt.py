@@ -61,9 +61,9 @@ class Prompt:
         return since_ns if now_ns - until_ns < SETTLE_NS else now_ns
 
     @contextmanager
-    def word(self) -> Iterator[None]:
-        """Do in this context what a client has asked for now."""
-        token = self._word.set(self.came_ns())
+    def word(self, came_ns: int | None = None) -> Iterator[None]:
+        """Do in this context what a client has asked for now, or as of an earlier ``came_ns``."""
+        token = self._word.set(self.came_ns() if came_ns is None else came_ns)
         try:
             yield
         finally:

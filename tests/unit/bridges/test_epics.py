@@ -8,6 +8,7 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import SimpleNamespace
@@ -249,6 +250,37 @@ def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -
     assert "@127.0.0.1:" in who
     assert calls == [("mod0", who, 0.5), ("mod0", who, "xaxis", 0.1)]
     assert [epics.is_loopback(host) for host in ("127.0.0.1", "::1", "localhost", "*", "10.0.0.1")] == [1, 1, 1, 0, 0]
+
+
+def test_a_put_that_waits_behind_another_came_before_and_keeps_up_no_stop(cell: Cell) -> None:
+    """As while a driver hangs: what was put before somebody stopped and reset all is not of after that."""
+    prompt, go_on = Prompt(), threading.Event()
+    words: list[int] = []
+
+    def move(*_: object) -> None:
+        words.append(Prompt._word.get(0))
+        assert go_on.wait(10.0)
+
+    held = SimpleNamespace(move=move, shown=lambda _: (0.5, 0, ""), sweep=bool)
+    bridge = epics.Bridge("", Putters(), prompt, held)  # type: ignore[arg-type]
+    look(bridge)
+    with serving(bridge) as client:
+
+        def put() -> None:
+            client.put("mod0:xaxis.VAL", 0.1, timeout=10.0)
+
+        putting = [threading.Thread(target=put) for _ in range(2)]
+        for thread in putting:
+            thread.start()
+            time.sleep(0.3)
+        assert len(words) == 1, "the second one waits"
+        client.put("mod0:xaxis.STOP", 1, timeout=5.0)
+        assert cell.node.stops == 1
+        reset_ns = time.monotonic_ns()
+        go_on.set()
+        for thread in putting:
+            thread.join()
+    assert len(words) == 2 and all(word < reset_ns for word in words)
 
 
 def test_where_one_cannot_listen_is_told(bridge: epics.Bridge) -> None:
