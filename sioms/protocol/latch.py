@@ -10,6 +10,7 @@ stopped stays so until ``resets`` changes: that is the last word of a reset that
 This is a software stop (category 1 or 2 of IEC 60204-1 at best), not a safety-rated function.
 """
 
+from .page import fence
 from .text import printable
 
 LATCH_SIZE = 4096
@@ -26,7 +27,8 @@ class Latch:
     Args:
         buffer: the latch page, LATCH_SIZE bytes; writable in the daemon.
 
-    Concurrency: one process writes; stores are single words, and come in the order in which they are made.
+    Concurrency: one process writes; stores are single words; the count of resets comes behind all that a reset says,
+    and is looked at before it, on any processor.
     """
 
     def __init__(self, buffer: memoryview) -> None:
@@ -42,9 +44,11 @@ class Latch:
     @property
     def resets(self) -> int:
         """How often the latch has been cleared; a stop between two looks shows as a change. All that a reset says is
-        there before it changes.
+        there before it changes, and is looked at after it.
         """
-        return self._words[_RESETS]
+        resets = self._words[_RESETS]
+        fence()
+        return resets
 
     @property
     def reset_ns(self) -> int:
@@ -130,6 +134,7 @@ class Latch:
             self._words[_ANSWERED_AT] = request[1]
             self._words[_ANSWERED] = request[0]  # last: half of it is older than the request
         self._words[_STOPPED] = 0
+        fence()
         self._words[_RESETS] += 1
 
     def daemon_alive(self, now_ns: int) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sioms.protocol import latch
 from sioms.protocol.flags import NodeClass
 from sioms.protocol.latch import LATCH_SIZE, Latch
 from sioms.protocol.markers import MARKERS, TABLE_SIZE, MarkerTable, split_token, token_of
@@ -30,6 +31,20 @@ def test_the_latch_holds_its_first_stop_until_reset() -> None:
     assert other.stop(7, "ö" * 300) and 100 < len(latch.source) <= 128
     latch.daemon_alive(9)
     assert other.daemon_alive_ns == 9 and other.stopped_ns == 7
+
+
+def test_no_processor_shows_the_count_of_a_reset_before_what_it_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    made = Latch(memoryview(bytearray(LATCH_SIZE)))
+    at_fences: list[tuple[object, ...]] = []
+
+    def fence() -> None:
+        at_fences.append((made.stopped_ns, made.answered_request, made.reset_ns, made._words[1]))
+
+    monkeypatch.setattr(latch, "fence", fence)
+    made.stop(3, "fire")
+    made.reset(5, (7, 8))
+    assert at_fences == [(0, (7, 8), 5, 0)], "all but the count"
+    assert made.resets == 1 and len(at_fences) == 2, "and who has read that looks at the rest behind it"
 
 
 def test_a_stop_and_reset_between_two_looks_shows() -> None:
