@@ -13,7 +13,7 @@ from sioms.reconcile.fit import Problem, block_ids, refit
 from sioms.reconcile.floor import lap
 from sioms.reconcile.locked import read_right
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import Noise, observer, sensor_noise
+from sioms.reconcile.noise import Noise, moves_at, observer, sensor_noise
 from sioms.reconcile.records import Session
 from sioms.reconcile.refuse import smoother_rest
 from sioms.reconcile.screen import thinned
@@ -38,9 +38,10 @@ def calibrated(problem: Problem, session: Session, model: AxisModel) -> Problem:
     if any(r.force_measured is not None for r in session.records):
         return _lowered(problem, model, lambda drive: observer(model, problem.noise.sensor, drive))
     laps = [lap(r, model.sample_time_s) for r in session.records]
-    stiffness = model.inertia * (2.0 * np.pi * UNMEASURED_HZ) ** 2
     coarse = model.effects.get("encoder_quantisation", {}).get("factor", 1.0)
     sensor = sensor_noise(read_right(session, model), model.resolution * coarse)
+    hertz = max(UNMEASURED_HZ, moves_at(session, sensor, model.sample_time_s))
+    stiffness = model.inertia * (2.0 * np.pi * hertz) ** 2
     problem = replace(problem, noise=observer(model, max(sensor, problem.noise.drive / stiffness), problem.noise.drive))
     for _ in range(2):
         if any(laps):

@@ -197,7 +197,7 @@ def free_parameters(model: AxisModel, frozen: Sequence[str] = ()) -> tuple[Free,
 
 def _free(model: AxisModel, name: str, p: Parameter, value: float) -> Free:
     scale = model.scale(p)
-    lower, upper = (-np.inf, np.inf) if p.phase else (p.lower * scale, p.upper * scale)
+    lower, upper = (-np.inf, np.inf) if p.phase else model.bounds(name, p)
     size = 1.0 if p.phase else max(abs(value), 0.1 * abs(p.start) * scale, 1e-12)
     return Free(name, p.symbol, size, lower, upper, p.phase)
 

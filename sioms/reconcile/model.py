@@ -122,6 +122,13 @@ class AxisModel:
             case Ref.ONE | Ref.TIME | Ref.FREQUENCY | Ref.ANGLE:
                 return 1.0
 
+    def bounds(self, name: str, parameter: Parameter) -> tuple[float, float]:
+        """Bounds of a parameter of an effect on this axis, in its own unit; those that the model states for it come
+        first.
+        """
+        size = self.scale(parameter)
+        return self.within.get(f"{name}.{parameter.symbol}", (parameter.lower * size, parameter.upper * size))
+
     def unit(self, parameter: Parameter) -> str:
         """Unit of a parameter on this axis."""
         return parameter.unit.format(F=self.force_unit, x=self.position_unit)

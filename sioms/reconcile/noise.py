@@ -12,15 +12,19 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.linalg import LinAlgError, expm, solve_discrete_are
-from scipy.signal import lfilter, ss2tf
+from scipy.signal import lfilter, ss2tf, welch
 
 from sioms.reconcile.effect import Array
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.stale import news
+from sioms.reconcile.thresholds import REACHED
 
 #: Relative drive noise assumed where no force was measured; refined from the innovations afterwards.
 DRIVE_NOISE_DEFAULT = 0.004
+#: Samples of a spectrum of the position, frequencies judged together, and the lowest one, of the sampling rate.
+SEGMENT, BAND, LOWEST = 128, 6, 0.06
+#: Motion is what has so many times the density of white noise; counts of slow motion are not white.
+ABOVE = 30.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,10 +146,47 @@ def _kalman(a: Array, b: Array, dt: float, sensor: float, drive: float) -> tuple
 
 
 def sensor_noise(session: Session, resolution: float) -> float:
-    """Standard deviation of the position reading, never below that of the count lattice."""
-    third = np.concatenate([np.diff(r.position, 3) for r in session.records])
-    white = np.sqrt(np.mean(third**2) / 20.0)
+    """Standard deviation of the position reading, never below that of the count lattice.
+
+    Motion that reaches the highest frequencies, or a wrong reading now and then, makes third differences many times as
+    large as noise does: then it is what the quietest frequencies hold.
+    """
+    third = [np.diff(r.position, 3) for r in session.records]
+    white = float(np.sqrt(np.mean(np.concatenate(third) ** 2) / 20.0))
+    if (least := _quietest(third)) < REACHED * white:
+        white = least
     return float(max(white, resolution / np.sqrt(12.0)))
+
+
+def _quietest(third: list[Array]) -> float:
+    """Return the standard deviation of white noise with the density of the quietest frequencies, by third differences.
+
+    Infinite where no record is long enough to tell. Of white noise it is 0.95 times what it should be, the least of
+    many.
+    """
+    long = [d for d in third if len(d) >= 4 * SEGMENT]
+    if not long:
+        return np.inf
+    found = [welch(d, nperseg=SEGMENT, detrend=False, average="median") for d in long]
+    f, density = found[0][0], np.average([p for _, p in found], axis=0, weights=[len(d) for d in long])
+    level = density[f > LOWEST] / (2.0 * np.sin(np.pi * f[f > LOWEST])) ** 6
+    bands = level[: len(level) // BAND * BAND].reshape(-1, BAND).mean(axis=1)
+    return float(np.sqrt(0.5 * np.min(bands)))
+
+
+def moves_at(session: Session, sensor: float, sample_time_s: float) -> float:
+    """Frequency [Hz] above which half of the power of the speed lies, of what stands out of that noise of the position;
+    0 where nothing does, or no record is long enough to tell.
+    """
+    long = [v for r in session.records if len(v := np.diff(r.position)) >= 4 * SEGMENT]
+    if not long:
+        return 0.0
+    found = [welch(v, nperseg=SEGMENT) for v in long]
+    f = found[0][0]
+    density = np.average([p for _, p in found], axis=0, weights=[len(v) for v in long])
+    noise = 2.0 * sensor**2 * (2.0 * np.sin(np.pi * f)) ** 2
+    power = np.cumsum(np.where(density > ABOVE * noise, density, 0.0))
+    return float(f[np.searchsorted(power, 0.5 * power[-1])] / sample_time_s)
 
 
 def drive_noise(
@@ -159,7 +200,7 @@ def drive_noise(
     found = []
     for r in session.records:
         if r.force_measured is not None:
-            second = np.diff((r.force_measured - delivered(r))[news(r.force_measured).rows], 2)
+            second = np.diff(r.force_measured - delivered(r), 2)
             found.append(1.4826 * np.median(np.abs(second)) / np.sqrt(6.0))
     floor = 1e-4 * rated_force
     return float(max(np.median(found), floor)) if found else DRIVE_NOISE_DEFAULT * rated_force

@@ -111,7 +111,7 @@ def leans(model: AxisModel, name: str) -> bool:
     if any(0.0 < given[q.symbol] < q.steps * model.resolution for q in free if q is not effect.primary):
         return True
     for q in [q for q in free if not q.soft]:
-        low, high = (bound * model.scale(q) for bound in (q.lower, q.upper))
+        low, high = model.bounds(name, q)
         signed = q.lower < 0.0 or effect.neutral != 0.0
         if given[q.symbol] > 0.98 * high or (signed and given[q.symbol] < low + 0.02 * abs(low)):
             return True

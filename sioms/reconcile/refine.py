@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from sioms.reconcile.effect import Array
+from sioms.reconcile.effects import known
 from sioms.reconcile.engine.fit import BASE, Free, fitted, get, put
 from sioms.reconcile.fit import Fit, Problem, closed_errors, free_parameters, refit
 from sioms.reconcile.free import HORIZONS_S, errors
@@ -27,10 +28,16 @@ TIMES = 3
 
 
 def bounded(model: AxisModel) -> AxisModel:
-    """Return the model with the bounds that its refined inertia has during a search."""
-    if "inertia" not in model.refine:
-        return model
-    return replace(model, within={"inertia": (model.inertia / WITHIN, model.inertia * WITHIN)})
+    """Return the model with the bounds that its refined inertia has during a search, and those of effects that it
+    states larger than any is sought: a fit that begins outside its bounds goes nowhere.
+    """
+    within = {"inertia": (model.inertia / WITHIN, model.inertia * WITHIN)} if "inertia" in model.refine else {}
+    for name, given in model.effects.items():
+        for p in (q for q in known()[name].parameters if not q.phase and not q.fixed):
+            (low, high), stated = model.bounds(name, p), given[p.symbol]
+            if not low <= stated <= high:
+                within[f"{name}.{p.symbol}"] = (min(low, WITHIN * stated), max(high, WITHIN * stated))
+    return replace(model, within=within)
 
 
 def runs_away(model: AxisModel) -> bool:
@@ -133,4 +140,5 @@ def _longest(problem: Problem, model: AxisModel) -> float:
 
 
 def _held(model: AxisModel) -> AxisModel:
-    return replace(model, refine=(), within={})
+    within = {key: span for key, span in model.within.items() if key not in model.refine}
+    return replace(model, refine=(), within=within)

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
@@ -31,7 +32,7 @@ from sioms.reconcile.plausible import (
     vacant,
 )
 from sioms.reconcile.screen import screen
-from sioms.reconcile.thresholds import AXIS, CLEAR, GAIN, LOOSE, PERIODIC_SURE, SPECIFIC, SURE
+from sioms.reconcile.thresholds import AXIS, CLEAR, GAIN, LOOSE, PERIODIC_SURE, SPECIFIC, SURE, WAVES
 from sioms.reconcile.variation import accompanied, exchanged, named
 
 PASSES = 4  # at most so many times more for a new gap, while it gains
@@ -334,9 +335,20 @@ class Searcher(Search[AxisModel]):
         return all(self._stays(new, fit, n) for n in kept)
 
     def _stays(self, new: Fit, fit: Fit, name: str) -> bool:
-        return physical(new, name) or (
+        return (physical(new, name) and self._repeats(new.model, name)) or (
             name in fit.model.effects and (small(new.model, name) or not physical(fit, name))
         )
+
+    def _repeats(self, model: AxisModel, name: str) -> bool:
+        """Say whether the travel holds enough periods of what repeats with place to have a name for it."""
+        effect = known()[name]
+        orders = [model.effects[name][p.symbol] for p in effect.parameters if p.fixed and p.unit == "1/pitch"]
+        return name not in library() or all(n * self._travel >= WAVES * model.pitch for n in orders)
+
+    @cached_property
+    def _travel(self) -> float:
+        places = [r.position[self._given.span(r)] for r in self._given.session.records]
+        return float(max(x.max() for x in places) - min(x.min() for x in places))
 
     def _with(self, fit: Fit, start: Start, iterations: int, best: float = np.inf) -> Fit:
         """Switch a candidate on, what it replaces off, and refit."""

@@ -245,6 +245,12 @@ public records (0780)."""
 WITHIN, WIDER = 4.0, 0.95
 """A refined inertia is within this multiple of the stated one while effects are searched; beyond it, beside all of
 them, where a free run then leaves less than this share. A joint of an arm: 43 without, where nothing shows (0780)."""
+WAVES = 1.5
+"""A wave has a name where the travel holds so many of its periods: over less a smooth force of place looks like it.
+The Silverbox, a resonator whose spring hardens, was named a wave of 0.87 of a period."""
+REACHED = 0.5
+"""Motion reaches the highest frequencies of a record, or a few readings are wrong, where the quietest ones hold less
+than this share of the noise that third differences show."""
 FELL = 0.7
 """The noise is taken again from what a search leaves when it fell below this share, and the search repeated."""
 
