@@ -13,7 +13,7 @@ from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.stopjournal import workcell_entry
 
 from .journals import OwnJournal
-from .stop_files import StopFiles, unheard
+from .stop_files import StopFiles, left
 from .stop_record import StopRecord
 
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
@@ -28,6 +28,7 @@ class Shared:
 
     Attributes:
         journal: what the daemon tells recorders.
+        left_word: of the last request to the file of the daemon before, which drivers of that may note still; 0: none.
         fds: descriptors of latch, stop-request file, file of the requests taken, marker table and journal of stops, as
             a driver gets them.
     """
@@ -35,8 +36,8 @@ class Shared:
     def __init__(self, path: str, record: StopRecord) -> None:
         self.record = record
         self.journal = OwnJournal()
-        word, source = unheard(path)
-        if word and word != record.state.request:  # who is late says that he has obeyed the one before
+        self.left_word, source = left(path)
+        if source and self.left_word != record.state.request:  # who is late says that he has obeyed the one before
             with suppress(OSError):  # it holds for our life then
                 record.note(workcell_entry(source, stop=True, named=True, resets=record.state.resets))
         self.files = StopFiles(path)

@@ -87,9 +87,9 @@ class StopFiles:
                 os.unlink(self._path + end)
 
 
-def unheard(path: str) -> tuple[int, str]:
-    """Return the word of the last stop that was asked for by files which another daemon has left, if nobody has said
-    that he has obeyed it, and who asked; 0: there is none.
+def left(path: str) -> tuple[int, str]:
+    """Return the word of the last stop that was asked for by files which another daemon has left, 0: there is none; and
+    who asked, if nobody has said that he has obeyed it, else ''.
     """
     fds: list[int] = []
     try:
@@ -102,7 +102,7 @@ def unheard(path: str) -> tuple[int, str]:
         fds.pop(0)
         word = request.mark[0]
         # Of a later word nobody has said so either: that may be of before a restart of the machine.
-        return (word, request.source) if word not in (0, request.obeyed) else (0, "")
+        return word, request.source if word not in (0, request.obeyed) else ""
     except FileNotFoundError:
         return 0, ""
     finally:

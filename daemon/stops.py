@@ -114,11 +114,11 @@ class Stops:
             by: number of the session.
         """
         latch, record, answered = self._shared.latch, self._shared.record, self._request_seen
-        word = answered[0] if answered[0] <= time.monotonic_ns() else 0  # anybody can write any
         record.look()
-        noted = record.state.requested
+        words = [answered[0]]
         if self._shared.request.mark == answered:  # then what drivers have read there was before it, whatever its word
-            word = max(word, noted)
+            words += record.state.requested, self._shared.left_word
+        word = max((word for word in words if word <= time.monotonic_ns()), default=0)  # anybody can write any
         entry = workcell_entry(who, stop=False, resets=latch.resets + 1, request=word)
         self._note(entry)  # first: a later stop is noted after it
         sent_ns = max(sent_ns, record.asked.own_of_any_ns(by))

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from daemon_rig import IO, Daemon, axes, raises, wait_for
+from daemon_rig import IO, Daemon, axes, has_ended, raises, wait_for
 
 import sioms
 from sioms.protocol.flags import AxisStatus
@@ -277,3 +277,25 @@ def test_a_reset_answers_every_request_before_the_one_that_is_there(daemon: Daem
         cell.reset()
         time.sleep(0.1)
         assert not cell.status()["stopped_ns"], "a reset that has been acknowledged"
+
+
+def test_a_driver_of_the_daemon_before_notes_no_stop_that_has_been_reset(start_daemon: Callable[..., Daemon]) -> None:
+    """It was frozen while its daemon died, with a request that others had heard, and goes on behind the next reset."""
+    daemon = start_daemon(CELL + axes("mod1", "xaxis"))
+    late = daemon.device("mod1")["pid"]
+    request = open_stop_request(daemon.socket)
+    assert request is not None
+    with contextlib.closing(request), daemon.frozen(late):
+        os.kill(daemon.pid, signal.SIGSTOP)
+        word = request.request(time.monotonic_ns(), os.getpid(), "smoke")
+        wait_for(lambda: request.taken(word), "another driver has heard")
+        os.kill(daemon.pid, signal.SIGKILL)
+        daemon.running.wait_exit(10.0)
+        again = start_daemon(daemon.config.read_text(), at=daemon.folder)
+        assert "smoke" in status(again)["stop_source"]
+        with again.cell() as cell:
+            cell.reset()
+    wait_for(lambda: has_ended(late), "it finds its daemon gone")
+    time.sleep(0.1)
+    assert not status(again)["stopped_ns"]
+    works(again)
