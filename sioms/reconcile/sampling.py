@@ -60,11 +60,11 @@ class Sampling:
                 f"the log tells the force late, by some {-1e3 * self.late * sample_time_s:.2g} ms (a filter?): it is "
                 f"read as a curve that much earlier{share}, and a delay or lag does not show"
             )
+        period = f"a period of some {2e3 * self.late * sample_time_s:.2g} ms" if self.late else "none that can be told"
         return (
-            "the log is slower than the loop that makes the force (a period of some "
-            f"{2e3 * self.late * sample_time_s:.2g} ms fits best{share}): the force is read as a curve through the "
-            "rows, and a delay or lag below half a sample does not show. loop_time_s in columns.toml would tell the "
-            "period"
+            f"the log is slower than the loop that makes the force ({period} fits best{share}): the force is read as a "
+            "curve through the rows, and a delay or lag below half a sample does not show. loop_time_s in columns.toml "
+            "would tell the period"
         )
 
 
