@@ -170,7 +170,8 @@ class OdriveUnit(AxesUnit):
             moving[axis] = abs(speeds[axis]) > self._standstill[axis]
             done[axis], holds[axis] = bool(arrived), state == CLOSED_LOOP
             if self._homes[axis]:
-                yield from self._follow_homing(axis, int(state), int(bits), moving, done)
+                feedback = yield from self._follow_homing(axis, int(state), int(bits), moving, done)
+                turns[axis], speeds[axis] = feedback or (turns[axis], speeds[axis])
             yield from self._judge(axis, int(bits), int(state))
         self._speeds = speeds
         self.report(turns * self._travel, speeds * self._travel, moving, done, self._faults, holds=holds)
@@ -447,17 +448,28 @@ class OdriveUnit(AxesUnit):
             self._set[axis] = kept
         return values
 
-    def _follow_homing(self, axis: int, state: int, bits: int, moving: Any, done: Any) -> Steps:
-        """Tell the bank that it homes; afterwards the board is idle and its loop is closed again."""
+    def _follow_homing(
+        self, axis: int, state: int, bits: int, moving: Any, done: Any
+    ) -> Generator[Step, Any, list[float] | None]:
+        """Tell the bank that it homes; afterwards the board is idle and its loop is closed again.
+
+        Returns:
+            Place and speed of an axis that is homed [turns, turns/s], read anew: the board is idle and homed a turn of
+            its loop before it counts from the new zero.
+        """
         moving[axis], done[axis] = True, False
         if bits:
             self._homes[axis], moving[axis] = False, False
         elif state != HOMING and self.clock() - self._homing_since_ns[axis] > SWITCH_ON_NS:
-            ((homed,),) = yield odrive.read([f"axis{self._numbers[axis]}.is_homed"], self._timeout_s)
+            number = self._numbers[axis]
+            (homed,), feedback = yield odrive.exchange([], [f"r axis{number}.is_homed", f"f {number}"], self._timeout_s)
             self._homes[axis], moving[axis], done[axis] = False, False, bool(homed)
             self._broken_off[axis] = not homed
             if homed:
                 yield from self._close_loop(axis)
+                place: list[float] = feedback
+                return place
+        return None
 
     def _judge(self, axis: int, bits: int, state: int) -> Steps:
         """Say why an axis cannot move; the details are read once a change."""

@@ -26,7 +26,7 @@ SHOWN = {
     "sioms/reconcile/live/watch.py": "since when an axis drifts, as text",
     "sioms/reconcile/report/watch.py": "since when an axis drifts, as text",
     "sioms/recording": "the names and the beginning of recordings",
-    "sioms/sdk/stops.py": "since when something has been stopped",
+    "sioms/sdk/resets.py": "since when something has been stopped",
     "sioms/timestamps.py": "the age of packets; where the clock has been set, they are refused",
     "tools": "what a person reads",
 }

@@ -386,9 +386,9 @@ def test_a_restart_while_the_link_is_lost_is_noticed_by_the_opening() -> None:
     run(rig, 1.0)  # and is not told again
 
 
-def homing_rig() -> Joined:
+def homing_rig(**keys: Any) -> Joined:
     axis = {"name": "x", "number": 0, "travel_per_turn": TURN, "force_max": 400.0, "homing": True, **LIMITS}
-    rig = Joined(Odrive, {"axis": [axis]}, lambda clock: odrive.Board(clock=clock))
+    rig = Joined(Odrive, {"axis": [axis], **keys}, lambda clock: odrive.Board(clock=clock))
     rig.do(rig.unit.open())
     return rig
 
@@ -423,3 +423,34 @@ def test_homing_turns_back_from_the_switch_and_holds() -> None:
     assert rotor.place == pytest.approx(-1.75, abs=0.02), "by the offset away from the switch"
     assert rotor.position == pytest.approx(0.0, abs=0.02)
     assert watch.low > -2.1 and watch.high < 0.01 and watch.speed < 2.5
+
+
+@pytest.mark.parametrize("phase_us", range(0, 12000, 1000))
+def test_a_homed_axis_is_told_from_its_new_zero_on(phase_us: int) -> None:
+    """The board is idle and homed a turn of its loop before its estimate counts from the new zero: a poll that comes in
+    that turn has the old place. The turn is of 4 ms here, so that the lines of a poll fall into it on a slow line, too.
+    """
+    rig = homing_rig()
+    rotor = rig.device.axes[0]
+    step, late = rotor.step, iter(range(4))
+
+    def stepped(dt: float, powered: bool = True) -> None:
+        old = rotor.p["encoder.pos_estimate"]
+        step(dt, powered)
+        if rotor.p["is_homed"] and next(late, None) is not None:
+            rotor.p["encoder.pos_estimate"] = old
+
+    rotor.step = stepped
+    rig.device.handlers()["switch"]("-2")
+    rig.do(rig.unit.home(0))
+    told: list[float] = []
+    report = rig.unit.report
+    rig.unit.report = lambda place, *rest, **more: (told.append(float(place[0])), report(place, *rest, **more))
+    rig.wait(1e-6 * phase_us)
+    for _ in range(6000):
+        rig.do(rig.unit.poll())
+        if not rig.unit._homes[0]:
+            break
+        rig.wait(1e-3)
+    assert rotor.p["is_homed"]
+    assert told[-1] == pytest.approx(0.0, abs=0.05 * TURN)
