@@ -40,7 +40,10 @@ def unlock(node: Any) -> None:
     """Reset until the controller's alarm is gone."""
 
     def good() -> bool:
-        node.reset()
+        try:
+            node.reset()
+        except BlockingIOError:  # the alarm has come behind it
+            return False
         time.sleep(0.1)
         return not any(s & (AxisStatus.FAULT | AxisStatus.EMERGENCY_STOP) for s in node.read().status)
 
