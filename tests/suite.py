@@ -4,7 +4,7 @@ environment of the tree.
     python tests/suite.py test [--quick [ARG...] | --durations]
     python tests/suite.py check | documents
 
-Tests of real processes and all that computes run side by side: docs/decisions/0731-tests-beside-tests.md.
+Tests of real processes and all that computes run side by side: docs/decisions/0731-the-suite.md.
 """
 
 from __future__ import annotations
