@@ -3,7 +3,7 @@
 What a driver adds to the kit is tried on the axes of all: places, velocities, and what is refused. What the kit does
 alone is tried once for each kind of bank, on a simulated axis, whose loop is closed here, and on a drive with a loop of
 its own. The stops of every driver with a line, from more states and in more ways, are trials of ``sioms driver check``:
-docs/decisions/0730-what-is-tried-on-every-driver.md.
+docs/decisions/0730-every-driver.md.
 """
 
 from __future__ import annotations
