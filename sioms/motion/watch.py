@@ -13,7 +13,7 @@ change. Found are
 * *lost*: the position is where the axis cannot have come since the last look. Its place is then no longer known.
 
 What is seen once is not believed, for one damaged reading must stop nothing; two looks make a finding: 20 to 40 ms at
-50 to 100 Hz. Why so: docs/decisions/0094-one-motion-watch.md.
+50 to 100 Hz. Why so: docs/decisions/0094-motion-watch.md.
 
 Pure; concurrency: that of its bank.
 """
