@@ -12,7 +12,7 @@ itself. Looked at is the raw position. Found are
 
 Steps are looked at from each reading to the next; the rest every LOOK_S, and is a finding when it is seen twice. Time
 is that of the readings: one that comes late, or twice, is no step. Why so:
-docs/decisions/0094-motion-watch.md, 0600-readings-are-judged-by-their-stamps.md.
+docs/decisions/0094-motion-watch.md, 0300-devices-of-devices.md.
 
 Pure; concurrency: that of its bank.
 """
