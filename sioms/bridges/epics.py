@@ -2,7 +2,7 @@
 
 One thread reads the pages and posts what has changed, one asks the daemon; the library's threads serve clients and
 carry out puts, so that no client is waited for. Set-points are taken only on request, and under a lease that the writer
-renews: docs/decisions/0336-epics.md, 0336-epics.md
+renews: docs/decisions/0336 and 0395
 """
 
 from __future__ import annotations

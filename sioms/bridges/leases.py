@@ -1,7 +1,7 @@
 """Nodes that a bridge holds for clients of its own, each for as long as its client renews its lease.
 
 The lease is that of the node, so that the driver halts its axes when the client, the bridge or the daemon between
-them is silent: docs/decisions/0336-epics.md
+them is silent: docs/decisions/0395
 """
 
 from __future__ import annotations

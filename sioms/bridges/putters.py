@@ -2,7 +2,7 @@
 
 What a client of PV Access says of itself, account and host, proves nothing. Of a connection within this machine the
 kernel knows who has made it (sock_diag(7)); of one from another machine nobody does:
-docs/decisions/0336-epics.md
+docs/decisions/0710
 """
 
 from __future__ import annotations

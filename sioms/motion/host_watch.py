@@ -12,7 +12,7 @@ itself. Looked at is the raw position. Found are
 
 Steps are looked at from each reading to the next; the rest every LOOK_S, and is a finding when it is seen twice. Time
 is that of the readings: one that comes late, or twice, is no step. Why so:
-docs/decisions/0094-motion-watch.md, 0300-devices-of-devices.md.
+docs/decisions/0165 and 0600.
 
 Pure; concurrency: that of its bank.
 """

@@ -1,7 +1,7 @@
 /* What every compiled pipe tool has in common: how it leaves a line to Python, and how it talks to the daemon.
  *
  * A tool stands after this text (devin.c), and what both take from the tools in Python stands before it; which is put
- * together by sioms.tools.compiled. Why so: docs/decisions/0002-start-of-pipe-tools.md.
+ * together by sioms.tools.compiled. Why so: docs/decisions/0285.
  */
 #include <errno.h>
 #include <fcntl.h>

@@ -3,7 +3,7 @@
  * Whatever is not usual (a long option, a path, a refusal, a gateway) is left to the tool in Python, which is
  * the reference: this program then becomes the command in its own arguments, before it has written anything. What it
  * shares with that tool (layout of pages and records, messages, options, formats) is in what sioms.tools.compiled puts
- * before this text and attach.c when they are compiled. Why so: docs/decisions/0002-start-of-pipe-tools.md.
+ * before this text and attach.c when they are compiled. Why so: docs/decisions/0285.
  */
 enum { MOST_TARGETS = 32 };
 

@@ -3,7 +3,7 @@
  * Whatever is not usual (a long option, a path, numbers from standard input, -r, -w, -H, a refusal to open, any mistake) is
  * left to the tool in Python, which is the reference: this program then becomes the command in its own arguments, before
  * it has written anything, and after it has given back what it has opened. From the write on it tells itself what happens.
- * What it shares with that tool stands before this text and attach.c: docs/decisions/0002-start-of-pipe-tools.md.
+ * What it shares with that tool stands before this text and attach.c: docs/decisions/0811.
  */
 enum { MOST_NUMBERS = 2048, MOST_DATA = 49152, WRITE_NUMBER = 1, IDLE_NUMBER = 2 };
 enum { FIRST_LOOK_MS = 1000, GRACE_MS = 2000, MOST_MS = 30000, LOOK_MS = 250 };

@@ -5,7 +5,7 @@ the mark is taken away before anything moves it, and comes back, with the new pl
 write into the kernel's memory, at the begin and the end of a motion, and what a killed process has written is in the
 file. What the kernel has not written out when the power goes is lost, so entries of an earlier boot count only if the
 process that wrote them ended in order. Where a mark cannot be taken away (EIO, a full disk), the file is.
-Why so: docs/decisions/0070-positions-over-a-restart.md, 0610-files-of-state.md.
+Why so: docs/decisions/0070 and 0610.
 
 Concurrency: the one thread of the driver process. A process that starts replaces the file by one of its own, so
 that one on its way out cannot write into it.
