@@ -1,4 +1,4 @@
-"""Decisions are found by their number: in one page or one section of a page, listed by subject, from wherever it is cited."""
+"""Decisions are found by their number: in one page or one section of a page, all listed by subject."""
 
 from __future__ import annotations
 
@@ -48,7 +48,9 @@ def test_cited_numbers_are_there() -> None:
     known = set().union(*NUMBERS.values())
     wrong, seen = [], 0
     for name, text in texts().items():
-        cited = [number.zfill(4) for first, rest in CITED.findall(text) for number in (first, *re.findall(r"\d{4}", rest))]
+        cited = [
+            number.zfill(4) for first, rest in CITED.findall(text) for number in (first, *re.findall(r"\d{4}", rest))
+        ]
         if name.startswith("docs/decisions/"):
             cited += BARE.findall(text)
         seen += len(cited)
