@@ -97,7 +97,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("names", nargs="*", metavar="NAME", help="sub-benches to run; all when none is named")
     parser.add_argument("--quick", action="store_true", help="fewer trials: seconds instead of minutes")
     parser.add_argument("--trials", type=whole(1), metavar="N", help="trials of each kill, hang and stop")
-    parser.add_argument("--soak", type=whole(1), metavar="N", help="opens and closes of the sub-bench open")
+    parser.add_argument(
+        "--soak", type=whole(1), metavar="N", help="opens and closes of open; seconds that recorder replays"
+    )
     parser.add_argument("--frames", type=whole(1), metavar="N", help="frames of the sub-bench fuzz")
     parser.add_argument("--files", type=whole(1), metavar="N", help="files of the sub-bench fuzz")
     parser.add_argument(

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,9 @@ AXES = 24
 SHARE = 0.03
 """Of a core, which recording 24 axes at 1 kHz may take."""
 _COUNT = struct.Struct("<Q")
+_SHORT_S = 60
+_FAST = 100.0
+"""How much faster than it was recorded a long recording is replayed, where the machine keeps up."""
 
 
 def bench_recorder(options: Options, report: Report) -> None:
@@ -45,10 +49,10 @@ def bench_recorder(options: Options, report: Report) -> None:
         _replay(options, report, daemon)
 
 
-def _record(daemon: Daemon, path: Path) -> subprocess.Popen[bytes]:
+def _record(socket: str, path: Path) -> subprocess.Popen[bytes]:
     """Start ``sioms record`` of everything."""
     words = [sys.executable, "-P", "-m", "sioms.tools.front", "record", "-o", str(path)]
-    environment = {**os.environ, "SIOMS_SOCKET": daemon.socket}
+    environment = {**os.environ, "SIOMS_SOCKET": socket}
     return subprocess.Popen(words, env=environment, stderr=subprocess.DEVNULL, preexec_fn=ends_with_us())
 
 
@@ -57,7 +61,7 @@ def _share(options: Options, report: Report, daemon: Daemon) -> None:
         with cell.open("mod0", "rw") as node:
             node.write([command(axis, velocity=1e-3) for axis in range(AXES)])
             path = Path(folder) / "a.mcap"
-            with _record(daemon, path) as process:
+            with _record(daemon.socket, path) as process:
                 wait_for(lambda: path.exists() and path.stat().st_size > 1_000_000, 30.0, "a recording")
                 times, size = CpuTimes({"recorder": process.pid}), path.stat().st_size
                 seconds = options.count(5, 60)
@@ -113,39 +117,67 @@ def _kills(options: Options, report: Report, daemon: Daemon) -> None:
 
 def _replay(options: Options, report: Report, daemon: Daemon) -> None:
     """Record, replay with a recorder beside it, and compare every column of every snapshot."""
+    seconds = options.soak or options.count(3, 60)
     with tempfile.TemporaryDirectory(prefix="sioms-record-") as folder:
         path, again = Path(folder) / "a.mcap", Path(folder) / "b.mcap"
-        with daemon.cell() as cell, cell.open("mod0", "rw") as node, _record(daemon, path) as process:
-            node.write([command(axis, velocity=1e-3 * (axis + 1)) for axis in range(4)])
-            time.sleep(options.count(3, 60))
+        with daemon.cell() as cell, cell.open("mod0", "rw") as node, _record(daemon.socket, path) as process:
+            for _ in range(seconds):
+                node.write([command(axis, velocity=0.01 * (random.random() - 0.5)) for axis in range(4)])
+                time.sleep(1.0)
             process.send_signal(signal.SIGINT)
-        words = [sys.executable, "-P", "-m", "sioms.tools.front"]
-        subprocess.run(
-            [*words, "replay", "-r", "2", str(path), "--", *words, "record", "-t", str(options.count(4, 40)), "-o",
-             str(again)],
-            check=True, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        )  # fmt: skip
-        for name, values in _values(path).items():
-            found = _values(again)[name]
-            differ, begin = _compare(values, found)
+        play(path, again, 2.0 if seconds <= _SHORT_S else _FAST)
+        for name, (differ, compared, begin) in compare(path, again).items():
             report.value(
                 f"values of {name} that a replay does not publish again", differ, bars=[Bar("value", 0)],
-                notes=f"of {values.size} in {len(values)} snapshots, from the {begin}. on",
+                notes=f"of {compared}, from the {begin}. snapshot on",
             )  # fmt: skip
 
 
-def _values(path: Path) -> dict[str, Any]:
-    """Return all columns of all snapshots of each node, without number, stamp and tick."""
-    with Recording(path) as recording:
-        return {name: np.concatenate([s[:, 4:] for s in recording.slots(name)]) for name in recording.nodes}
+def play(path: Path, again: Path, rate: float) -> None:
+    """Replay a recording to its end at so many times its speed, and record that."""
+    with tempfile.TemporaryDirectory(prefix="sioms-replay-") as folder:
+        words, socket = [sys.executable, "-P", "-m", "sioms.tools.front"], f"{folder}/sock"
+        replay = subprocess.Popen(
+            [*words, "replay", "-r", str(rate), "--socket", socket, str(path)],
+            stdout=subprocess.DEVNULL, preexec_fn=ends_with_us(),
+        )  # fmt: skip
+        wait_for(lambda: os.path.exists(socket), 30.0, "a replay")
+        with _record(socket, again) as recorder:
+            replay.wait()
+            recorder.send_signal(signal.SIGINT)
 
 
-def _compare(values: Any, found: Any) -> tuple[int, int]:
-    """Return how many values differ from where the second recording begins, and where that is.
+def compare(path: Path, again: Path) -> dict[str, tuple[int, int, int]]:
+    """Compare a recording with that of its replay, in which a snapshot's number is its place in the first one.
 
-    The recorder of a replay may come after its first snapshots; from then on all must follow, up to the last.
+    The recorder of a replay comes after its first snapshots; from then on all must follow, up to the last.
+
+    Returns:
+        By node how many values differ or are missing, of how many, and from which snapshot on.
     """
-    begin = len(values) - len(found)
-    if begin < 0:
-        return int(found.size - values.size), 0
-    return int(np.count_nonzero(values[begin:] != found)), begin
+    with Recording(path) as first, Recording(again) as second:
+        return {name: _compare(first.slots(name), second.slots(name)) for name in first.nodes}
+
+
+def _compare(recorded: Iterator[Any], published: Iterator[Any]) -> tuple[int, int, int]:
+    rest = _counted(next(recorded))
+    differ = compared = begin = after = 0
+    for rows in published:
+        numbers = rows[:, 0].astype(np.int64)
+        while after + len(rest) < numbers[-1] and (more := next(recorded, None)) is not None:
+            rest = np.concatenate([rest, _counted(more)])
+        if not begin:
+            begin = int(numbers[0])
+            rest, after = rest[begin - 1 :], begin - 1
+        wanted, rest = rest[: numbers[-1] - after], rest[numbers[-1] - after :]
+        found = np.isin(np.arange(after + 1, after + 1 + len(wanted)), numbers)
+        same = _counted(rows)[: int(found.sum())]
+        differ += int(np.count_nonzero(wanted[found] != same)) + abs(len(wanted) - len(rows)) * wanted.shape[1]
+        compared, after = compared + wanted.size, after + len(wanted)
+    left = rest.size + sum(_counted(rows).size for rows in recorded)
+    return differ + left, compared + left, begin
+
+
+def _counted(slots: Any) -> Any:
+    """Return what a replay does not change: the tick, and all columns of all channels."""
+    return slots[:, [2, *range(4, slots.shape[1])]]
