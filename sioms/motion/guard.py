@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sioms.protocol.flags import AxisStatus
 
 from .axis_step import FORCE
+from .law import ControlLaw
 from .queue import CommandQueue
 from .sequencer import Sequencer
 from .types import EventKind
@@ -29,12 +30,12 @@ class LimitGuard:
 
     Args:
         queue, sequencer: of the bank.
-        speed_most: speed at which a force ends, by axis [unit/s]: that of its command, else the limit of the axis.
+        law: of the bank: it has the speed at which a force ends, and tells where a command's gains are in force.
     """
 
-    def __init__(self, queue: CommandQueue, sequencer: Sequencer, speed_most: NDArray[np.float64]) -> None:
+    def __init__(self, queue: CommandQueue, sequencer: Sequencer, law: ControlLaw) -> None:
         self._queue = queue
-        self._speed_most = speed_most
+        self._law = law
         self._limits = queue.limits
         self._sequencer = sequencer
 
@@ -53,7 +54,7 @@ class LimitGuard:
         if force.any():
             state[force] = sequencer.state(axes[force], now_ns)[:, :2]
         side = self._beyond(axes, state)
-        hit = (side != 0) | (force & (np.abs(state[:, 1]) > self._speed_most[axes]))
+        hit = (side != 0) | (force & (np.abs(state[:, 1]) > self._law.speed_most[axes]))
         if not hit.any():
             return False
         for bit, sign in ((AxisStatus.LIMIT_MINUS, -1), (AxisStatus.LIMIT_PLUS, 1)):
@@ -61,7 +62,7 @@ class LimitGuard:
         sequencer.outcome[axes[hit & force]] |= int(AxisStatus.FORCE_ENDED)
         self._queue.emit(EventKind.DROPPED, axes[hit], now_ns, errno.ERANGE, TEXT)
         sequencer.drop(axes[hit])
-        free = force | sequencer.is_tuned(axes)  # not where their set-points are
+        free = force | self._law.tuned[axes]  # not where their set-points are
         if (hit & free).any():
             sequencer.stop(axes[hit & free], now_ns, now_ns)
         for axis in axes[hit & ~free].tolist():

@@ -90,7 +90,7 @@ class AxisBank(Bank):
         self._short_way = ShortWay(self._sequencer, self._queue, self._law, self.plans)
         self._braked_ns = 0
         """When the stop of these axes began [ns]; 0: there are none."""
-        self._guard = LimitGuard(self._queue, self._sequencer, self._law.speed_most)
+        self._guard = LimitGuard(self._queue, self._sequencer, self._law)
         self._homing = HomingRuns(settings, self._queue, self)
         self._motion_watch = HostWatch(settings, tick_s, self._law)
         arrays = self.arrays = self._law.arrays
@@ -205,7 +205,7 @@ class AxisBank(Bank):
             self._sequencer.hold(rests, self._position[rests], self._last_ns)
             if moving.size:
                 state = np.stack(self._law.actual(moving), axis=1)
-                self._sequencer.brake(moving, state, self._last_ns, self._sequencer.hardest(moving))
+                self._sequencer.brake(moving, state, self._last_ns, self._sequencer.hardest[moving])
 
     def _is_too_late(self, start_ns: int, now_ns: int) -> bool:
         return now_ns - start_ns > self._tick_s * 1e9
@@ -453,7 +453,7 @@ class AxisBank(Bank):
             if moving.size:
                 place[goes_on] += law.relieve(moving, np.zeros(moving.size))  # its damping shall not come at once
                 state = np.stack((place[goes_on], self._velocity[moving]), axis=1)
-                sequencer.brake(moving, state, self._last_ns, sequencer.hardest(moving))
+                sequencer.brake(moving, state, self._last_ns, sequencer.hardest[moving])
             self._desired[axes], self._desired_velocity[axes] = place, np.where(goes_on, self._velocity[axes], 0.0)
         turned, part = law.force_ends.turned(
             self._velocity, law.velocity_limit, law.drive(self._desired), self._last_ns
@@ -466,7 +466,7 @@ class AxisBank(Bank):
             if not rests.all():
                 moving = turned[~rests]
                 state = np.stack((place[~rests], self._velocity[moving]), axis=1)
-                sequencer.brake(moving, state, self._last_ns, sequencer.hardest(moving))
+                sequencer.brake(moving, state, self._last_ns, sequencer.hardest[moving])
             self._desired[turned] = place
         letting_go = np.flatnonzero(self._lets_go)
         if letting_go.size:

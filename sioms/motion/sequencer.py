@@ -23,6 +23,7 @@ from .arrival import Arrivals
 from .axis_step import BRAKE, FORCE, HOLD, POSITION, RATE, SETTLING, STOP
 from .commands import Command
 from .law import ControlLaw
+from .noted import Noted
 from .pace import Pace
 from .plan_step import STILL, Plans
 from .planning import Planned, Planning
@@ -44,7 +45,8 @@ _HOMING = int(AxisStatus.HOMING)
 class Sequencer:
     """Plans of n axes in time. Arrays (n,): ``kind`` of the running plan, ``guard`` where soft limits are
     watched in every tick, ``outcome`` LIMIT_* and MISSED_TARGET of the last motion, ``status`` and ``in_motion``
-    as they change with events, ``stopped`` where the last motion has been broken off by a stop.
+    as they change with events, ``stopped`` where the last motion has been broken off by a stop, ``hardest`` the
+    configured deceleration, for velocities that no profile has made.
 
     Args:
         settings: one per axis.
@@ -85,21 +87,14 @@ class Sequencer:
         self._in_motion = in_motion
         self.planning = Planning(settings, queue, store, law)
         self._row_kind = np.zeros(2 * n, dtype=np.int64)
-        self._row_guard = np.zeros(2 * n, dtype=bool)
         self._row_command: list[Command | None] = [None] * (2 * n)
-        self._row_signals = np.zeros(2 * n, dtype=bool)
-        self._row_sets = np.zeros(2 * n, dtype=bool)
-        self._row_checked = np.zeros(2 * n, dtype=bool)
-        self._row_taken = np.zeros(2 * n, dtype=bool)
+        flags = (np.zeros(2 * n, dtype=bool) for _ in range(5))
+        self._row_guard, self._row_signals, self._row_sets, self._row_checked, self._row_taken = flags
         self.arrivals = arrivals
-        self._hardest = np.array([s.acceleration_max for s in settings])
+        self.hardest = np.array([s.acceleration_max for s in settings])
         self._ready = np.zeros(n, dtype=bool)
         self._todo: dict[int, None] = {}
-        self._ended_ns, self._started_ns, self._idle_ns = (np.zeros(n, dtype=np.int64) for _ in range(3))
-        """When steps have found ends and begins that are yet to be told [ns]; 0: they have not."""
-        self._noted = (
-            (EventKind.ENDED, self._ended_ns), (EventKind.STARTED, self._started_ns), (EventKind.IDLE, self._idle_ns),
-        )  # fmt: skip
+        self._noted = Noted(n)
         self.pace = Pace(law.begun, tick_s)
         self._tick_s = tick_s
 
@@ -135,10 +130,6 @@ class Sequencer:
     def is_plain(self) -> bool:
         """Tell whether no axis presses, or has, or is held back, and no arrival is looked at."""
         return not (self.any_force or self.pace.held or self.arrivals.watched or self._law.force_ends.any)
-
-    def is_taken_up(self, axis: int) -> bool:
-        """Tell whether the play of an axis is taken up at the end of what runs."""
-        return bool(self._row_taken[self.store.row.item(axis)])
 
     def begun(self, axes: Sequence[int], now_ns: int) -> None:
         """Go on behind plans that steps have begun at now on these axes, for which nothing else waits."""
@@ -201,24 +192,15 @@ class Sequencer:
             end_ns=store.end_ns, cut_ns=store.cut_ns, duration=store.duration, final=store.final,
             row_kind=self._row_kind, row_signals=self._row_signals, row_checked=self._row_checked,
             row_taken=self._row_taken, stopped=self.stopped, fresh=fresh,
-            braked_ns=0, outcome=self.outcome, in_motion=self._in_motion, awaited=0, ended_ns=self._ended_ns,
-            idle_ns=self._idle_ns, untold=0, follows=0, ready=self._ready, gated_synch=self._queue.gated_synch,
+            braked_ns=0, outcome=self.outcome, in_motion=self._in_motion, awaited=0, ended_ns=self._noted.ended_ns,
+            idle_ns=self._noted.idle_ns, untold=0, follows=0, ready=self._ready, gated_synch=self._queue.gated_synch,
             gated_marker=self._queue.gated_marker, row_guard=self._row_guard, row_sets=self._row_sets,
-            started_ns=self._started_ns, started=0, tick_s=self._tick_s, state=np.zeros(3), **store.segments,
+            started_ns=self._noted.started_ns, started=0, tick_s=self._tick_s, state=np.zeros(3), **store.segments,
         )  # fmt: skip
 
     def tell_ends(self) -> None:
         """Tell of the ends and begins that steps have found, in their order; those of a tick together."""
-        found: list[tuple[int, EventKind, Axes]] = []
-        for kind, noted_ns in self._noted:
-            axes = np.flatnonzero(noted_ns)
-            when_ns = noted_ns[axes]
-            found += [(at_ns, kind, axes[when_ns == at_ns]) for at_ns in set(when_ns.tolist())]
-            if kind == EventKind.STARTED:
-                self._todo.update(dict.fromkeys(axes.tolist()))
-            noted_ns[axes] = 0
-        for at_ns, kind, axes in sorted(found, key=lambda each: each[0]):  # those of a tick in the order of kinds
-            self._queue.emit(kind, axes, at_ns)
+        self._todo.update(dict.fromkeys(self._noted.tell(self._queue)))
         self._settle_masks()
 
     def after_stop(self) -> None:
@@ -261,7 +243,7 @@ class Sequencer:
         behind = law.is_behind(axes) & (law.stepper[axes] | ~tuned)
         if tuned.any() or pressing.any():
             measured = (tuned | pressing) & ~law.stepper[axes]  # no profile has made their velocities
-            most[measured] = self._hardest[axes[measured]]
+            most[measured] = self.hardest[axes[measured]]
             state[tuned, 1] = law.actual(axes[tuned])[1]
             state[tuned, 0] = law.brace(axes, seen_ns)[tuned]
             state[pressing, 0] += law.hold_load(axes[pressing])
@@ -283,14 +265,6 @@ class Sequencer:
         beyond: Floats = np.where(self._law.stepper[axes], 0.0, stand - kept)
         self._law.come_nearer(axes, beyond)
         return beyond
-
-    def is_tuned(self, axes: Axes) -> NDArray[np.bool_]:
-        """Tell on which axes gains or the greatest force of a command are in force (m,)."""
-        return self._law.tuned[axes]
-
-    def hardest(self, axes: Axes) -> Floats:
-        """Return the configured deceleration of axes, whose velocities no profile has made (m,)."""
-        return self._hardest[axes]
 
     def brake(self, axes: Axes, state: Floats, start_ns: int, most: Floats) -> None:
         """Stop from state (m, 2 or 3) at a deceleration of most (m,), beginning at start_ns."""
@@ -517,7 +491,7 @@ class Sequencer:
             self._queue.emit(EventKind.IDLE, came[self.is_idle(came)], now_ns)
         chosen = axes[~still]
         if chosen.size:
-            deceleration = np.where(pressed, self._hardest[axes], self._limits.acceleration[axes])[~still]
+            deceleration = np.where(pressed, self.hardest[axes], self._limits.acceleration[axes])[~still]
             store.put_brake(store.row[chosen], state[~still, 0], state[~still, 1], deceleration)
             self._set_kind(chosen, BRAKE)
             self._ready[chosen] = False  # what was planned ahead would begin in motion

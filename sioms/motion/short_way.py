@@ -62,7 +62,7 @@ class ShortWay:
                     return False
                 begin_step.look_at_state(plans, axis, now_ns)
                 position, velocity, acceleration = self._state.tolist()
-                taken = not replace and sequencer.is_taken_up(axis)
+                taken = not replace and bool(plans.row_taken[plans.row[axis]])
                 planned.append(sequencer.planning.planned(axis, command, (position, velocity, acceleration), taken))
         except InfeasibleError:
             return False
