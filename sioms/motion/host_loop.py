@@ -96,7 +96,6 @@ class AxisBank(Bank):
         arrays = self.arrays = self._law.arrays
         self._limp, self._actuator, self._last_raw = self._law.limp, self._law.actuator, arrays["last_raw"]
         self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
-        self._any_limp = False
         self._lets_go = np.zeros(self.n, dtype=bool)
         """Axes that press no more when they have come to rest."""
         self._tick_s, self._makes_up = tick_s, makes_up
@@ -185,7 +184,6 @@ class AxisBank(Bank):
 
     def _set_limp(self, axes: Axes) -> None:
         self._limp[axes], self._lets_go[axes] = True, False
-        self._any_limp = bool(self._limp.any())
         self._sequencer.settle(axes, self._last_ns)
 
     def _recover(self, axes: Axes, latched: Axes) -> None:
@@ -199,7 +197,6 @@ class AxisBank(Bank):
         limp = axes[self._limp[axes]]
         if limp.size:
             self._limp[limp] = False
-            self._any_limp = bool(self._limp.any())
             moves = self._law.moves(limp)
             rests, moving = limp[~moves], limp[moves]
             self._sequencer.hold(rests, self._position[rests], self._last_ns)
