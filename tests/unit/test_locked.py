@@ -30,8 +30,7 @@ Pins = dict[str, list[tuple[Version, Marker | None, int]]]
 def pinned(profile: str) -> Pins:
     """Return the packages of a file: version, condition and number of hashes, by name."""
     pins: Pins = defaultdict(list)
-    text = (TREE / "etc" / "locked" / f"{profile}.txt").read_text()
-    for entry in re.findall(r"^[^\s#].*?(?=^\S|\Z)", text, re.MULTILINE | re.DOTALL):
+    for entry in re.findall(r"^[^\s#].*?(?=^\S|\Z)", DEV["listed"](profile), re.MULTILINE | re.DOTALL):
         line = Requirement(entry.partition("\\")[0])
         (only,) = line.specifier
         assert only.operator == "=="
@@ -82,11 +81,17 @@ def test_what_is_needed_in_turn_is_locked_and_is_what_runs_here(profile: str) ->
                 queue += [(more, one) for one in ("", *more.extras)]
 
 
-def test_the_smaller_ones_take_the_versions_of_the_tests() -> None:
-    tested = pinned("test")
-    for profile in ("service", "run"):
-        for name, lines in pinned(profile).items():
-            assert {version for version, _, _ in lines} <= {version for version, _, _ in tested[name]}, name
+def test_the_larger_ones_begin_with_the_smaller_ones_and_no_package_stands_twice() -> None:
+    lines = DEV["listed"]("test").splitlines()
+    entries = [line for line in lines if line[:1] not in ("", " ", "#")]
+    assert len(entries) == len(set(entries)) > 100
+    assert all(set(DEV["pins"](smaller)) < set(DEV["pins"]("test")) for smaller in ("service", "run"))
+    text = {profile: (TREE / "etc" / "locked" / f"{profile}.txt").read_text() for profile in PROFILES}
+    assert [re.findall("^-r .*", text[name], re.MULTILINE) for name in PROFILES] == [
+        ["-r run.txt"],
+        ["-r service.txt"],
+        [],
+    ]
 
 
 def wheel(folder: Path, name: str, version: str, *more: str) -> str:
