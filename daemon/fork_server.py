@@ -50,7 +50,9 @@ class ForkServer:
     ) -> None:
         self._loop = loop
         self._died = died
-        self._sock, self.pid = process or start_fork_server()
+        process = process or start_fork_server()
+        self._sock, self.pid = socket.socket(fileno=process.fd), process.pid
+        self._sock.setblocking(False)
         self._pidfd = os.pidfd_open(self.pid)
         self._answers: dict[int, Answer] = {}
         self._unsent: deque[tuple[int, bytes, list[int]]] = deque()

@@ -5,26 +5,30 @@ own.
 from __future__ import annotations
 
 import os
-import socket
 import sys
-from typing import NamedTuple
+
+# Not ``socket``, ``typing`` and ``signal``, with ``enum``: the fork server would wait for them as long as an
+# interpreter takes to start, and a daemon for the fork server.
+from _socket import AF_UNIX, SOCK_SEQPACKET, socketpair
 
 from sioms.safe_path import safe_environment
 
 _SIGINT = 2
-"""Of Linux; importing ``signal`` would delay the fork server by the import of ``enum``."""
+"""Of Linux."""
 
 
-class ForkServerProcess(NamedTuple):
+class ForkServerProcess:
     """A running fork server.
 
     Args:
-        sock: non-blocking socket to it; the fork server ends when this closes.
+        fd: of a non-blocking socket to it; the fork server ends when this closes.
         pid: its process.
     """
 
-    sock: socket.socket
-    pid: int
+    __slots__ = ("fd", "pid")
+
+    def __init__(self, fd: int, pid: int) -> None:
+        self.fd, self.pid = fd, pid
 
 
 def start_fork_server() -> ForkServerProcess:
@@ -33,17 +37,20 @@ def start_fork_server() -> ForkServerProcess:
     Raises:
         OSError: no process or no descriptor is left.
     """
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    ours, theirs = socketpair(AF_UNIX, SOCK_SEQPACKET)
     ours.setblocking(False)  # a fork server that is stuck in a driver's import must not hold up the daemon
-    with theirs:
-        theirs.set_inheritable(True)
-        environment = dict(
-            safe_environment(os.environ),
-            OPENBLAS_NUM_THREADS="1",
-            OMP_NUM_THREADS="1",
-            PYTHONFAULTHANDLER="1",
-        )
-        arguments = [sys.executable, "-P", "-m", "sioms.sdk.fork_server", str(theirs.fileno())]
+    environment = dict(
+        safe_environment(os.environ),
+        OPENBLAS_NUM_THREADS="1",
+        OMP_NUM_THREADS="1",
+        PYTHONFAULTHANDLER="1",
+    )
+    # Not by ``-m``, which imports a third as long as an interpreter takes to start.
+    run = f"from sioms.sdk.fork_server import main; main({theirs.fileno()})"
+    try:
+        os.set_inheritable(theirs.fileno(), True)
         # A terminal's Ctrl-C is for the daemon, whose end ends the fork server.
-        pid = os.posix_spawn(sys.executable, arguments, environment, setsigmask=[_SIGINT])
-        return ForkServerProcess(ours, pid)
+        pid = os.posix_spawn(sys.executable, [sys.executable, "-P", "-c", run], environment, setsigmask=[_SIGINT])
+    finally:
+        theirs.close()
+    return ForkServerProcess(ours.detach(), pid)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import Enum
+
+from msgspec import Struct
 
 from . import modes
 from .commands import Command
@@ -22,8 +23,7 @@ class ActionKind(Enum):
     """Clear the drive's own fault."""
 
 
-@dataclass(frozen=True, slots=True)
-class DriveAction:
+class DriveAction(Struct, frozen=True):
     """One thing that the driver shall send to one drive.
 
     Args:

@@ -10,9 +10,9 @@ from __future__ import annotations
 import errno
 import math
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import AxisStatus

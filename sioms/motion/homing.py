@@ -9,11 +9,11 @@ until the axis stands again.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol, assert_never
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import AxisStatus
@@ -51,8 +51,7 @@ class Mover(Protocol):
         """Add to the coordinate of the axis, also in motion."""
 
 
-@dataclass(slots=True)
-class Progress:
+class Progress(Struct):
     """One axis on its way home."""
 
     homing: Homing

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import errno
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import AxisStatus
@@ -35,8 +35,7 @@ PIECE = 256
 """Records that are judged in one go: some 0.3 ms."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Judged:
+class Judged(Struct, frozen=True, eq=False):
     """A written array that was found good, and on what that rests.
 
     Attributes:

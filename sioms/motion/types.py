@@ -1,10 +1,10 @@
 """What the motion core and its host say to each other: errors, events, and the seams of markers and kept positions."""
 
-from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 
@@ -74,8 +74,7 @@ class EventKind(Enum):
     HOMED = "homed"
 
 
-@dataclass(frozen=True, slots=True)
-class Event:
+class Event(Struct, frozen=True):
     """One thing that happened at once to one or many axes.
 
     Args:

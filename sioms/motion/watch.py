@@ -22,11 +22,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import NamedTuple
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from . import modes
@@ -89,8 +89,7 @@ class Finding(NamedTuple):
     drifts: bool = False
 
 
-@dataclass(slots=True)
-class _State:
+class _State(Struct):
     order: Order = Order.HOLD
     goal: float = 0.0
     before: tuple[tuple[Order, float], ...] = ()

@@ -5,15 +5,14 @@ finer than the tick in which they are found.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
+from msgspec import Struct
 
 from .binary_step import Beams
 
 
-@dataclass(frozen=True, slots=True)
-class Edge:
+class Edge(Struct, frozen=True):
     """A change of a binary signal.
 
     Args:
@@ -47,8 +46,7 @@ def port_values(value: int, edges: Sequence[tuple[Edge, int]]) -> list[tuple[int
     return changes
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class Box(Struct, frozen=True):
     """Positions at which an object breaks a beam: every listed coordinate lies within its interval.
 
     Args:
@@ -150,8 +148,7 @@ def _union(spans: list[tuple[float, float]]) -> list[tuple[float, float]]:
     return merged
 
 
-@dataclass(frozen=True, slots=True)
-class SquareWave:
+class SquareWave(Struct, frozen=True):
     """A stimulus: high for a part of each period.
 
     Args:

@@ -20,10 +20,10 @@ Units: "force" is N or N m, "position" m or rad, as the axis has it.
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from sioms.documents import toml_of
@@ -44,8 +44,7 @@ class Place(Enum):
     ENCODER = "position to reading"
 
 
-@dataclass(frozen=True, slots=True)
-class Parameter:
+class Parameter(Struct, frozen=True):
     """One number of an effect.
 
     Args:
@@ -62,8 +61,7 @@ class Parameter:
     neutral: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(Struct, frozen=True):
     """One kind of effect: where it acts, what it does, its parameters."""
 
     place: Place
@@ -71,8 +69,7 @@ class Kind:
     parameters: Mapping[str, Parameter]
 
 
-@dataclass(frozen=True, slots=True)
-class Effect:
+class Effect(Struct, frozen=True):
     """One kind of effect on a bank of n axes.
 
     Args:

@@ -8,10 +8,10 @@ never drive it.
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from .effects import Effect
@@ -19,8 +19,7 @@ from .effects import Effect
 Array = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Motion:
+class Motion(Struct, frozen=True):
     """What a force may depend on, at the mid-point of a substep, shape (n,) each, filled by the bank.
 
     Args:

@@ -6,10 +6,10 @@ simulated device loads it only where a file is given, and knows nothing of who w
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from .drive import DriveEffect
@@ -21,8 +21,7 @@ GROUP = "sioms.twins"
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, slots=True)
-class Laws:
+class Laws(Struct, frozen=True):
     """Further laws of a bank.
 
     Args:

@@ -13,9 +13,8 @@ a conservative force without friction the leapfrog method, whose energy error st
 Conventions: ``state`` is an array of shape (2, n), velocities in row 0, positions in row 1.
 """
 
-from dataclasses import dataclass
-
 import numpy as np
+from msgspec import Struct
 from numpy.typing import NDArray
 
 from .friction_step import Friction, glide, keep
@@ -25,8 +24,7 @@ Array = NDArray[np.float64]
 _SERIES_BELOW = 1e-2
 
 
-@dataclass(frozen=True, slots=True)
-class Directed:
+class Directed(Struct, frozen=True):
     """A coefficient for motion in the positive and in the negative direction, shape (n,) each."""
 
     plus: Array

@@ -31,7 +31,6 @@ from sioms.protocol.flags import Request
 
 from .blocks import AnyBlock, BlockSpec, Description
 from .exchange import Steps
-from .golden import Golden
 from .locks import claims_of
 from .settings import LineSettings
 
@@ -42,6 +41,7 @@ if TYPE_CHECKING:
     from sioms.motion import DriveAction, MarkerPort
     from sioms.protocol.nodeinfo import ChannelInfo
 
+    from .golden import Golden
     from .pages import Pages
 
 

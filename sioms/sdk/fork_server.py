@@ -1,7 +1,7 @@
 """The fork server: imports drivers once, validates their settings, and forks a process for each device, or for those
 that the configuration gives one process.
 
-Started by the daemon as ``python -m sioms.sdk.fork_server FD``. Forking shares the memory of the
+Started by the daemon, which calls ``main`` in an interpreter of its own. Forking shares the memory of the
 libraries among all drivers, and makes a restart a matter of milliseconds. The fork server has one thread
 and no state but imported modules; drivers live on when it dies, and it ends when the daemon does.
 """
@@ -18,8 +18,9 @@ import traceback
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import Any
+
+from msgspec import Struct, field
 
 from sioms.descriptors import is_readable, receive
 from sioms.protocol.driver_verbs import TO_FORK_SERVER, Describe, Spawn
@@ -136,8 +137,7 @@ def _fork(sock: socket.socket, hosts: Hosts) -> tuple[int, int]:
     return 0, -1
 
 
-@dataclass(slots=True)
-class Host:
+class Host(Struct):
     """A process of several devices.
 
     Attributes:
@@ -246,7 +246,3 @@ class Hosts:
         for _, fds in host.unsent:
             for fd in fds:
                 os.close(fd)
-
-
-if __name__ == "__main__":
-    main(int(sys.argv[1]))

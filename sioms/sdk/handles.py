@@ -16,11 +16,11 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from sioms.protocol.flags import Access, Right
@@ -83,8 +83,7 @@ class Writing(Protocol):
         """Let the later writes of the handle have their turn."""
 
 
-@dataclass(slots=True, eq=False)
-class Handle:
+class Handle(Struct, eq=False):
     """One open node of one client.
 
     Attributes:
@@ -146,8 +145,8 @@ class Handle:
     queued_bytes: int = 0
     reset_ns: int = 0
     cut_short: dict[int, tuple[int, str]] = field(default_factory=dict)
-    writes: bool = field(init=False)
-    axes: list[int] = field(init=False)
+    writes: bool = False
+    axes: list[int] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.writes = self.exclusive and bool(self.access & Access.WRITE)
@@ -220,8 +219,7 @@ class Handle:
             return
 
 
-@dataclass(slots=True, eq=False)
-class Wait:
+class Wait(Struct, eq=False):
     """A request that is answered later.
 
     Attributes:

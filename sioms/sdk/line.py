@@ -10,11 +10,12 @@ Concurrency: owned by the driver process's one thread; driven by ``receive`` and
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from enum import Enum, IntEnum, auto
 from heapq import heappop, heappush
 from itertools import count
 from typing import Any
+
+from msgspec import Struct, field
 
 from .connection import Connection
 from .exchange import DeviceError, Exchange, HookError, LinkError, Pause, Send, SideExchange, Step, Steps
@@ -49,8 +50,7 @@ Done = Callable[[Any, Exception | None], None]
 """Called with a job's return value, or with the LinkError or DeviceError that ended it."""
 
 
-@dataclass(slots=True, eq=False)
-class Job:
+class Job(Struct, eq=False):
     """One run of a hook."""
 
     steps: Steps
@@ -58,8 +58,7 @@ class Job:
     done: Done
 
 
-@dataclass(slots=True)
-class Counters:
+class Counters(Struct):
     """What the line has been through."""
 
     requests: int = 0
@@ -84,8 +83,7 @@ class _State(Enum):
     SIDE_LINE = auto()
 
 
-@dataclass(slots=True)
-class _Running:
+class _Running(Struct):
     job: Job
     step: Step | None = None
     attempts: int = 0

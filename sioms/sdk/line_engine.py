@@ -5,9 +5,10 @@ from __future__ import annotations
 import errno
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
+
+from msgspec import Struct
 
 from sioms.motion import DriveAction, DriveBank
 from sioms.protocol.flags import PageState
@@ -44,8 +45,7 @@ class _UnitState:
         self.silent_ticks = self.usual_ticks = 0
 
 
-@dataclass(slots=True, eq=False)
-class _Write:
+class _Write(Struct, eq=False):
     """A client's write of outputs that is not done yet; one that a stop or a safe value has overtaken is void."""
 
     block: AnyBlock

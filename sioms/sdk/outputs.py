@@ -16,8 +16,9 @@ Pure; concurrency: the one thread of the driver process.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
+
+from msgspec import Struct
 
 from .blocks import AnyBlock, AxisBlock, BinaryBlock, BlockSpec
 
@@ -47,8 +48,7 @@ class Change(NamedTuple):
         return (int(self.value) ^ int(other.value)) & self.mask & other.mask != 0
 
 
-@dataclass(slots=True)
-class _Safe:
+class _Safe(Struct):
     """Bits (or the value) of a channel that shall be safe."""
 
     mask: int

@@ -7,8 +7,9 @@ Parts, what the requests of clients need is Service.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Protocol
+
+from msgspec import Struct
 
 from .blocks import AnyBlock
 from .driver import Driver
@@ -30,8 +31,7 @@ class Report(Protocol):
         """Return it; None when it is not ``fresh`` and may be made only between ticks, or a user has had his turn."""
 
 
-@dataclass(frozen=True, slots=True)
-class Parts:
+class Parts(Struct, frozen=True):
     """What an engine works with."""
 
     loop: Loop
@@ -44,8 +44,7 @@ class Parts:
     log: Log
 
 
-@dataclass(frozen=True, slots=True)
-class Service(Parts):
+class Service(Parts, frozen=True):
     """What the requests of clients work with."""
 
     driver: Driver

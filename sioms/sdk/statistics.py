@@ -120,7 +120,7 @@ class Reports:
         report["handles"] = len(self._handles)
         counters = getattr(self._engine, "counters", None)
         if counters is not None:
-            report["link"] = {name: getattr(counters, name) for name in counters.__slots__}
+            report["link"] = {name: getattr(counters, name) for name in counters.__struct_fields__}
         if counters := self._driver.counters():
             report["stream"] = dict(counters)
         return report

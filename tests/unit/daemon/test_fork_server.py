@@ -26,7 +26,7 @@ def silent() -> Iterator[ForkServerProcess]:
     with subprocess.Popen(["sleep", "100"]) as process, theirs:
         while _state(process.pid) != "S":
             time.sleep(0.01)
-        yield ForkServerProcess(ours, process.pid)
+        yield ForkServerProcess(ours.detach(), process.pid)
         process.kill()
 
 
@@ -51,7 +51,7 @@ def test_more_requests_than_the_socket_holds_wait_for_their_turn() -> None:
     ours.setblocking(False)
     with subprocess.Popen(["sleep", "5"]) as process, theirs, open(os.devnull) as null:
         loop, asked, answers = Loop(), [], list[int]()
-        fork_server = ForkServer(loop, lambda _: None, ForkServerProcess(ours, process.pid))
+        fork_server = ForkServer(loop, lambda _: None, ForkServerProcess(ours.detach(), process.pid))
         table = {"text": "x" * 20_000}
         for number in range(100):
             fork_server.spawn(
