@@ -12,12 +12,12 @@ from typing import Any
 
 import msgspec
 import pytest
+from settings_rig import OF_THE_DAEMON, changed, said
 
 from sioms.hand.slow import slowed
-from sioms.sdk.finding import describe, find_driver, read_settings
+from sioms.sdk.finding import find_driver, read_settings
 
 ETC = Path(__file__).resolve().parents[3] / "etc"
-OF_THE_DAEMON = ("driver", "description", "lease_s", "realtime_priority", "hang_s", "process")
 DEVICES = ("world", "hand", "left", "touch1", "wrist1")
 UNBOUNDED = {
     "hand": {"link_stiffness"},
@@ -42,22 +42,6 @@ def numbers(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]
         yield path
 
 
-def changed(table: Any, path: tuple[Any, ...], number: float) -> Any:
-    """Return a table with another number."""
-    table = json.loads(json.dumps(table))
-    at = table
-    for key in path[:-1]:
-        at = at[key]
-    at[path[-1]] = number
-    return table
-
-
-def said(driver: Any, table: Any) -> list[str]:
-    """Return what is said of a device's table."""
-    settings, errors = read_settings(driver, table, str(ETC))
-    return errors if settings is None else errors + describe(driver, "it", settings)[1]
-
-
 @pytest.mark.parametrize("name", DEVICES)
 def test_no_number_of_a_hands_cell_is_none_or_without_bound(name: str) -> None:
     written = tomllib.loads((ETC / "hand.toml").read_text(encoding="utf-8"))["device"][name]
@@ -66,14 +50,14 @@ def test_no_number_of_a_hands_cell_is_none_or_without_bound(name: str) -> None:
     settings, errors = read_settings(driver, table, str(ETC))
     assert not errors
     whole = json.loads(json.dumps(msgspec.to_builtins(settings)))
-    assert not said(driver, whole)
+    assert not said(driver, whole, ETC)
     paths = [path for path in numbers(whole) if not (path[0] == "axis" and path[1] == 1)]
     assert len(paths) > 5
     passed = {
         ".".join(map(str, path))
         for path in paths
         for number in (math.nan, math.inf, -math.inf)
-        if not said(driver, changed(whole, path, number))
+        if not said(driver, changed(whole, path, number), ETC)
         and (math.isnan(number) or not {*path} & (LIMITS | UNBOUNDED.get(name, set())))
     }
     assert not passed, "these numbers may be none, or without bound"
@@ -84,7 +68,7 @@ def test_a_cell_in_slow_motion_is_within_all_bounds(pace: float) -> None:
     tables = tomllib.loads((ETC / "hand.toml").read_text(encoding="utf-8"))
     for device in slowed(tables, pace, ETC)["device"].values():
         table = {key: value for key, value in device.items() if key not in OF_THE_DAEMON}
-        assert not said(find_driver(device["driver"], str(ETC)), table)
+        assert not said(find_driver(device["driver"], str(ETC)), table, ETC)
 
 
 @pytest.mark.parametrize(("driver", "table", "words"), [
@@ -95,5 +79,5 @@ def test_a_cell_in_slow_motion_is_within_all_bounds(pace: float) -> None:
     ("sim-axes", {"late_max_s": 0.0, "axis": []}, "late_max_s 0; want at least a tick|axis: none given"),
 ])  # fmt: skip
 def test_numbers_below_what_they_can_be_are_refused(driver: str, table: Any, words: str) -> None:
-    (error,) = said(find_driver(driver, "/"), table)
+    (error,) = said(find_driver(driver, "/"), table, ETC)
     assert re.search(words, error), error

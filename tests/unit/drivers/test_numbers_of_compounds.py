@@ -11,11 +11,11 @@ from typing import Any
 
 import msgspec
 import pytest
+from settings_rig import OF_THE_DAEMON, changed, said
 
-from sioms.sdk.finding import describe, find_driver, read_settings
+from sioms.sdk.finding import find_driver, read_settings
 
 ROOM = Path(__file__).resolve().parents[3] / "drivers" / "compound"
-OF_THE_DAEMON = ("driver", "description", "lease_s", "realtime_priority", "hang_s", "process")
 WRONG = (math.nan, math.inf, -math.inf, -1.0, 0.0, 1e-300, 1e12, -1e12, "x", True, [], {})
 ANY_SIGN = {"position_min", "position_max", "facing_rad", "pivot_m", "table_m"}
 FITTING: dict[str, tuple[Any, ...]] = {
@@ -44,22 +44,6 @@ def leaves(value: Any, path: tuple[Any, ...] = ()) -> Iterator[tuple[Any, ...]]:
         yield path
 
 
-def changed(table: Any, path: tuple[Any, ...], value: Any) -> Any:
-    """Return a table with another value."""
-    table = json.loads(json.dumps(table))
-    at = table
-    for key in path[:-1]:
-        at = at[key]
-    at[path[-1]] = value
-    return table
-
-
-def said(driver: Any, table: Any) -> list[str]:
-    """Return what is said of a device's table."""
-    settings, errors = read_settings(driver, table, str(ROOM))
-    return errors if settings is None else errors + describe(driver, "it", settings)[1]
-
-
 def fits(path: tuple[Any, ...], value: Any) -> bool:
     """Return whether a value is one that its key may have."""
     key = next(part for part in reversed(path) if isinstance(part, str))
@@ -82,13 +66,13 @@ def test_no_setting_of_a_compound_measures_nothing(kind: str, device: Any) -> No
     settings, errors = read_settings(driver, {k: v for k, v in device.items() if k not in OF_THE_DAEMON}, str(ROOM))
     assert not errors
     whole = json.loads(json.dumps(msgspec.to_builtins(settings)))
-    assert not said(driver, whole)
+    assert not said(driver, whole, ROOM)
     paths = [path for path in leaves(whole) if path[:1] != ("axis",) or path[1] in (0, len(whole["axis"]) - 1)]
     assert len(paths) > 20
     passed, silent = [], []
     for path in paths:
         for value in WRONG:
-            sentences = said(driver, changed(whole, path, value))
+            sentences = said(driver, changed(whole, path, value), ROOM)
             if not sentences and not fits(path, value):
                 passed.append((".".join(map(str, path)), value))
             if sentences and not all(len(one.split()) > 3 for one in sentences):
@@ -101,5 +85,5 @@ def test_what_an_unbounded_velocity_was_taken_for_is_told() -> None:
     device = tomllib.loads((ROOM / "gantry.toml").read_text(encoding="utf-8"))["device"]["bridge"]
     table = {key: value for key, value in device.items() if key not in OF_THE_DAEMON}
     table["axis"][1]["velocity_max"] = math.inf
-    (sentence,) = said(find_driver("gantry", str(ROOM)), table)
+    (sentence,) = said(find_driver("gantry", str(ROOM)), table, ROOM)
     assert "axis y: velocity_max inf; want 1e-09 to 10000" in sentence
