@@ -231,7 +231,6 @@ class World:
         self._inertia = body.mass * outline.gyration_m**2
         self._most_force = body.platen_friction * body.mass * GRAVITY
         self._most_moment = self._most_force * _mean_distance(outline)
-        self._step_s = 0.0
         for finger in self.fingers:
             self._touch(finger, 0.0)
 

@@ -177,7 +177,6 @@ class Recording:
         self._odd: list[str] = []
         """Sentences about what the file says of itself."""
         self.is_packed = self.size > 100 and self._read(self.size - 8, 8) == mcap.MAGIC
-        self._lengths: dict[int, int] = {}
         self._events = -1
         self._known: dict[bytes, int] = {}
         self._head()
