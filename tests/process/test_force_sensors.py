@@ -91,7 +91,7 @@ def lost_and_back(wire: Sensor, cause: str, words: str, cure: str = "clear") -> 
     wire.wait_up("f0")
 
 
-def test_ft300_streams_through_damage_loss_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
+def test_ft300_streams_through_damage_and_a_restart(start: Callable[..., Any], short_folder: Path) -> None:
     wire = Sensor(start, short_folder, "ft300.simulator", "--baud", "19200")
     wire.tell("register 410 0")
     cell = wire.serve("[device.f0]\n" + FT300)
@@ -118,13 +118,6 @@ def test_ft300_streams_through_damage_loss_and_deaths(start: Callable[..., Any],
         # a sensor that began anew streams no more: it is told to again
         wire.tell("power_cycle 0.3")
         wait_for(lambda: wire.tell("state")["streaming"], "streaming again")
-        wire.wait_up("f0")
-        lost_and_back(wire, "unplug", "is gone|no such port", "plug")
-        # a driver that was killed left the stream running; the next one ends it first
-        pid = wire.pid("f0")
-        os.kill(pid, signal.SIGKILL)
-        assert wire.tell("state")["streaming"]
-        wait_for(lambda: wire.pid("f0") not in (0, pid), "a new driver")
         wire.wait_up("f0")
     wire.daemon.signal(signal.SIGTERM)
     assert wire.daemon.wait_exit(15) == 0
@@ -196,7 +189,7 @@ def test_ft300_configured_wrongly(start: Callable[..., Any], short_folder: Path)
         assert not wire.reads(name)
 
 
-def test_ati_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], short_folder: Path) -> None:
+def test_ati_through_a_bad_network_and_stalls(start: Callable[..., Any], short_folder: Path) -> None:
     wire = Sensor(start, short_folder, "ati_rdt.simulator", "--port", "0")
     cell = wire.serve(ATI)
     wire.wait_up("f0")
@@ -245,10 +238,6 @@ def test_ati_through_a_bad_network_stalls_and_deaths(start: Callable[..., Any], 
         node.ioctl(Request.CALIBRATE_DEVICE, timeout=5.0)
         wait_for(lambda: not flags(node), "good behind a new zero")
     lost_and_back(wire, "stall", "start the realtime stream: no reply|no good frame", "resume")
-    pid = wire.pid("f0")
-    os.kill(pid, signal.SIGKILL)
-    wait_for(lambda: wire.pid("f0") not in (0, pid), "a new driver")
-    wire.wait_up("f0")
     wire.daemon.signal(signal.SIGTERM)
     assert wire.daemon.wait_exit(15) == 0
     wait_for(lambda: not wire.tell("state")["streaming"], "the stream stopped")
