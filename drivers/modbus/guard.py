@@ -32,7 +32,6 @@ class Guard:
         mapped: the device and its map.
         timeout_s: of the dead-man that the driver sets [s]; 0: it sets none.
         log: takes a level and a sentence.
-        draw: returns a random integer of a range, ends included.
     """
 
     def __init__(
@@ -40,9 +39,8 @@ class Guard:
         mapped: MappedUnit,
         timeout_s: float = 0.0,
         log: Callable[[str, str], None] = lambda level, text: None,
-        draw: Callable[[int, int], int] = random.randint,
     ) -> None:
-        self._mapped, self._log, self._draw = mapped, log, draw
+        self._mapped, self._log = mapped, log
         self._quantities = {"timeout": timeout_s}
         rmap = mapped.rmap
         self._dead, self._restart = rmap.dead_man, rmap.restart
@@ -159,7 +157,7 @@ class Guard:
         if not name or (present := (yield from self._reads(name))) is None:
             return False
         forgotten = self._token is not None and present != self._token
-        token = self._draw(self._restart.minimum, self._restart.maximum - 1)
+        token = random.randint(self._restart.minimum, self._restart.maximum - 1)
         token += token >= present >= self._restart.minimum  # any but the present one
         yield from self._mapped.command("token", token=float(token))
         self._token = float(token)

@@ -253,13 +253,13 @@ class Waits:
         effects: where the effects of what has waited are noted.
         journal: where refusals are noted.
         log: writes a line of a level to the daemon's log.
+
+    Attributes:
         a_look: how many of each user are looked at after a publication.
     """
 
-    def __init__(
-        self, effects: Effects, journal: JournalWriter, log: Callable[[str, str], None], a_look: int = LOOKS_A_MS
-    ) -> None:  # fmt: skip
-        self.a_look = a_look
+    def __init__(self, effects: Effects, journal: JournalWriter, log: Callable[[str, str], None]) -> None:
+        self.a_look = LOOKS_A_MS
         self._log = log
         self._effects = effects
         self._journal = journal

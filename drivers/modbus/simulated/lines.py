@@ -471,11 +471,11 @@ async def _frame(reader: asyncio.StreamReader) -> bytes:
     return head + await reader.readexactly(int.from_bytes(head[4:6], "big"))
 
 
-def serial_parser(description: str, units: str = "1") -> argparse.ArgumentParser:
+def serial_parser(description: str) -> argparse.ArgumentParser:
     """Return the options that all serial simulators have."""
     parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--link", type=Path, help="fixed path of the port")
-    parser.add_argument("--units", default=units, help="addresses on the line, e.g. 1,2,3")
+    parser.add_argument("--units", default="1", help="addresses on the line, e.g. 1,2,3")
     parser.add_argument("--baud", type=int, default=0, help="let replies take the time of a line of this speed")
     return parser
 

@@ -40,7 +40,6 @@ class Recorder:
         wanted: nodes; none: all.
         seen: called with each event, after it has been recorded.
         log: called with a sentence that its user shall see.
-        past: whether the events that the journals keep from before are recorded, too.
 
     Attributes:
         recorded: snapshots that are safe, by node.
@@ -53,12 +52,11 @@ class Recorder:
     def __init__(
         self, sink: Sink, connect: Callable[[], Workcell], wanted: Sequence[str] = (), *,
         seen: Callable[[Event], None] = lambda _event: None, log: Callable[[str], None] = lambda _text: None,
-        past: bool = False,
     ) -> None:  # fmt: skip
         self.recorded: dict[str, int] = {}
         self.lost: dict[str, int] = {}
         self._sink, self._connect, self._wanted = sink, connect, list(wanted)
-        self._seen, self._log, self._past = seen, log, past
+        self._seen, self._log = seen, log
         self._schemas: dict[tuple[str, str], int] = {}
         self._channels = 0
         self._taps: dict[str, tuple[NodeTap, NodeFormat]] = {}
@@ -109,7 +107,7 @@ class Recorder:
             for device in ["", *[each["name"] for each in cell.status()["devices"]]] if self._may_hear else []:
                 if device not in self._journals:
                     fds = cell.journal(device)
-                    self._journals[device] = JournalTap(*fds, device or "daemon", from_start=self._past)
+                    self._journals[device] = JournalTap(*fds, device or "daemon")
         except OSError as error:
             if error.errno not in (errno.EPERM, errno.EROFS):
                 raise

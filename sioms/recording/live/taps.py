@@ -149,10 +149,9 @@ class JournalTap:
         fd: of the journal; it is closed.
         leash: descriptor that becomes readable when the right to it ends; it is closed with the tap.
         source: whose it is, as events tell it.
-        from_start: whether it begins with the oldest event that is kept.
     """
 
-    def __init__(self, fd: int, leash: int, source: str, *, from_start: bool = False) -> None:
+    def __init__(self, fd: int, leash: int, source: str) -> None:
         self.source = source
         self._leash, self._poll = leash, poll()
         self._poll.register(leash, POLLIN)
@@ -160,7 +159,7 @@ class JournalTap:
             self._map = mmap.mmap(fd, os.fstat(fd).st_size, prot=mmap.PROT_READ)
         finally:
             os.close(fd)
-        self._reader = JournalReader(self._map, from_start=from_start)
+        self._reader = JournalReader(self._map, from_start=False)
         self._lost = 0
 
     def take(self) -> tuple[list[Event], int]:
