@@ -112,7 +112,7 @@ class OdriveUnit(AxesUnit):
         self._character_s = line.bits_per_character / line.baud if line.serial else 0.0
         self._timeout_s = settings.timeout_s + 80 * n * self._character_s
         self._uptime = Uptime(0.001, 2**32, digits=9)
-        self._homes = [False] * n
+        self._homes, self._has_homed = [False] * n, [False] * n
         self._broken_off = [False] * n
         self._may_hold = [False] * n
         self._is_idle = [False] * n
@@ -130,7 +130,8 @@ class OdriveUnit(AxesUnit):
     def open(self) -> Steps:
         """Identify the board, stop its motors, set its watchdog and close the loops."""
         n = len(self._numbers)
-        self._homes, self._may_hold, self._is_idle = [False] * n, [False] * n, [False] * n
+        self._homes, self._has_homed = [False] * n, [False] * n
+        self._may_hold, self._is_idle = [False] * n, [False] * n
         self._fixed, self._set = [{} for _ in range(n)], [{} for _ in range(n)]
         yield from self._flush()
         paths = [f"fw_version_{part}" for part in ("major", "minor", "revision")]
@@ -170,8 +171,7 @@ class OdriveUnit(AxesUnit):
             moving[axis] = abs(speeds[axis]) > self._standstill[axis]
             done[axis], holds[axis] = bool(arrived), state == CLOSED_LOOP
             if self._homes[axis]:
-                feedback = yield from self._follow_homing(axis, int(state), int(bits), moving, done)
-                turns[axis], speeds[axis] = feedback or (turns[axis], speeds[axis])
+                yield from self._follow_homing(axis, int(state), int(bits), moving, done)
             yield from self._judge(axis, int(bits), int(state))
         self._speeds = speeds
         self.report(turns * self._travel, speeds * self._travel, moving, done, self._faults, holds=holds)
@@ -226,13 +226,16 @@ class OdriveUnit(AxesUnit):
         """Brake along the ramp and hold; the fastest stop lets go, or brakes with all there is. Sent until it is
         confirmed.
         """
-        homed, self._homes[axis] = self._homes[axis], False
-        if homed or (fastest and self._settings.quick_stop == "idle"):
+        searches = self._homes[axis] and not self._has_homed[axis]
+        self._homes[axis] = self._has_homed[axis] = False
+        if searches or (fastest and self._settings.quick_stop == "idle"):
             yield from self._let_go(axis)
         elif fastest:
             yield from self._velocity(axis, 0.0, None)
         else:
             yield from self._velocity(axis, 0.0, abs(self.bank.settings[axis].acceleration_max / self._travel[axis]))
+        if searches:
+            yield from self._see_zero(axis)
 
     def home(self, axis: int) -> Steps:
         """Begin the board's homing."""
@@ -243,7 +246,7 @@ class OdriveUnit(AxesUnit):
         yield confirmed([f"w {homed} 0"], [(homed, 0.0)], self._timeout_s, repeatable=True)
         yield odrive.exchange([begin], [f"f {number}"], self._timeout_s)
         self._homing_since_ns[axis] = self.clock()
-        self._homes[axis] = True
+        self._homes[axis], self._has_homed[axis] = True, False
 
     def reset(self, axis: int) -> Steps:
         """Clear the board's errors and close the loop again."""
@@ -448,28 +451,36 @@ class OdriveUnit(AxesUnit):
             self._set[axis] = kept
         return values
 
-    def _follow_homing(
-        self, axis: int, state: int, bits: int, moving: Any, done: Any
-    ) -> Generator[Step, Any, list[float] | None]:
-        """Tell the bank that it homes; afterwards the board is idle and its loop is closed again.
+    def _follow_homing(self, axis: int, state: int, bits: int, moving: Any, done: Any) -> Steps:
+        """Tell that the axis homes until it is homed, its loop closed again, and it stands.
 
-        Returns:
-            Place and speed of an axis that is homed [turns, turns/s], read anew: the board is idle and homed a turn of
-            its loop before it counts from the new zero.
+        The board lets go when its homing ends, at whatever speed the axis then has, and it runs on until the loop is
+        closed. An error ends the homing by a stop.
         """
-        moving[axis], done[axis] = True, False
+        stands, moving[axis], done[axis] = not moving[axis], True, False
         if bits:
-            self._homes[axis], moving[axis] = False, False
+            moving[axis] = not stands
+        elif self._has_homed[axis]:
+            if stands and (state == CLOSED_LOOP or not self._settings.axis[axis].enable):
+                self._homes[axis] = self._has_homed[axis] = moving[axis] = False
+                done[axis] = True
         elif state != HOMING and self.clock() - self._homing_since_ns[axis] > SWITCH_ON_NS:
-            number = self._numbers[axis]
-            (homed,), feedback = yield odrive.exchange([], [f"r axis{number}.is_homed", f"f {number}"], self._timeout_s)
-            self._homes[axis], moving[axis], done[axis] = False, False, bool(homed)
-            self._broken_off[axis] = not homed
+            ((homed,),) = yield odrive.read([f"axis{self._numbers[axis]}.is_homed"], self._timeout_s)
             if homed:
+                self._has_homed[axis] = True
                 yield from self._close_loop(axis)
-                place: list[float] = feedback
-                return place
-        return None
+            else:
+                self._homes[axis], self._broken_off[axis], moving[axis] = False, True, not stands
+
+    def _see_zero(self, axis: int) -> Steps:
+        """Say that the place is lost where the board has set its zero though its homing was stopped.
+
+        It does in the turn in which it ends; and where it is stopped while it closes its loop at the switch, it takes
+        that place for its zero.
+        """
+        ((homed,),) = yield odrive.read([f"axis{self._numbers[axis]}.is_homed"], self._timeout_s)
+        if homed:
+            self.lose_place(axis, "its homing was stopped while the board set its zero; RESET, then HOME again")
 
     def _judge(self, axis: int, bits: int, state: int) -> Steps:
         """Say why an axis cannot move; the details are read once a change."""
@@ -483,7 +494,8 @@ class OdriveUnit(AxesUnit):
             self._faults[axis] = BROKEN_OFF
         elif not bits:
             settled = self.clock() - self._closed_ns[axis] > SWITCH_ON_NS
-            off = self._may_hold[axis] and settled and state == IDLE and not self._homes[axis]
+            searches = self._homes[axis] and not self._has_homed[axis]
+            off = self._may_hold[axis] and settled and state == IDLE and not searches
             self._faults[axis] = "the axis is idle; check its calibration" if off else ""
 
 

@@ -7,7 +7,8 @@ only the first letter tells the command; numbers are read as far as they go; set
 cut to nine characters. What hangs behind it is in ``odrive_axis``. Commands on standard input, beside those of the
 line:
 
-``state [AXIS]``, ``error BITS [AXIS]``, ``switch TURNS [AXIS]`` (end switch for homing), ``set PATH VALUE`` (and keep
+``state [AXIS]``, ``error BITS [AXIS]``, ``switch TURNS [AXIS]`` (end switch for homing), ``reference [off]`` (an end
+switch near axis 0, or none), ``set PATH VALUE`` (and keep
 it without supply), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE [AXIS]``
 (velocity, torque, position, mode), ``shove V [AXIS]``.
 """
@@ -28,6 +29,8 @@ from .simulated.axis import CLOSED_LOOP, FLAGS, IDLE, READ_ONLY, STORED, UNSIGNE
 __all__ = ["CLOSED_LOOP", "IDLE", "Axis", "Board"]
 
 MAX_LINE, MAX_REPLY = 256, 64
+REFERENCE_TURNS = 3.0
+"""How far away the end switch is put."""
 FOREVER = 1 << 30
 _INTEGER = r"\s*([+-]?\d+)"
 _FLOAT = r"\s*([+-]?(?:\d+\.?\d*(?:e[+-]?\d+)?|\.\d+(?:e[+-]?\d+)?|nan|inf(?:inity)?))"
@@ -294,6 +297,11 @@ class Board:
             axis.switch = axis.origin + float(turns)
             axis.p["min_endstop.config.enabled"] = axis.stored["min_endstop.config.enabled"] = 1
 
+        def reference(off: str = "") -> None:
+            axis = self.axes[0]
+            axis.switch = None if off else axis.place - REFERENCE_TURNS
+            axis.p["min_endstop.config.enabled"] = axis.stored["min_endstop.config.enabled"] = not off
+
         def set_(path: str, value: str) -> None:
             found = self._find(path)
             if found is None:
@@ -312,7 +320,7 @@ class Board:
         def shove(speed: str, index: str = "0") -> None:
             self.axes[int(index)].shoved = float(speed)
 
-        return {"state": self.state, "error": error, "switch": switch, "set": set_, "power_cycle": self.power_cycle,
+        return {"state": self.state, "error": error, "switch": switch, "reference": reference, "set": set_, "power_cycle": self.power_cycle,
                 "refuse": refuse, "freeze": freeze, "foreign": self.foreign, "shove": shove}  # fmt: skip
 
 

@@ -9,7 +9,7 @@ mode; setting the actual position in position mode starts the motor. A restart f
 from 0 where the motor stands.
 
 Commands on standard input, beside those of the line: ``state [MOTOR]``, ``flags VALUE [MOTOR]`` (driver errors), ``ends
-LOW HIGH [MOTOR]``, ``store`` (what was written to the EEPROM), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze
+LOW HIGH [MOTOR]``, ``reference [off]`` (the left switch near motor 0, or none), ``store`` (what was written to the EEPROM), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze
 [COUNT]``, ``foreign velocity|position VALUE [MOTOR]``, ``shove VELOCITY [MOTOR]``, ``brown_out`` (of an evaluation
 board's motor supply).
 """
@@ -33,6 +33,8 @@ READABLE = SETTABLE | {0, 1, 2, 3, 8, 9, 10, 11, 135, 138, 196, 197, 206, 207, 2
 STARTUP = {4: 512_000, 5: 512_000, 6: 128, 7: 8, 140: 8, 194: 20000, 195: 2000, 193: 1}
 """Axis parameters after a start: other than any driver's limits."""
 READS = (6, 10, 136)
+REFERENCE_STEPS = 20000
+"""How far away the left switch is put."""
 
 
 class Motor:
@@ -323,6 +325,11 @@ class Module:
             mover = self.motors[int(axis)].mover
             mover.low, mover.high = number(low), number(high)
 
+        def reference(off: str = "") -> None:
+            self.time.catch_up()
+            mover = self.motors[0].mover
+            mover.low = -1e12 if off else mover.position - REFERENCE_STEPS
+
         def power_cycle(seconds: str = "0.2") -> None:
             self.power_cycle(number(seconds))
 
@@ -355,7 +362,7 @@ class Module:
                 motor.mover.halt()
 
         return {
-            "state": state, "flags": flags, "ends": ends, "store": lambda: self.stored, "power_cycle": power_cycle,
+            "state": state, "flags": flags, "ends": ends, "reference": reference, "store": lambda: self.stored, "power_cycle": power_cycle,
             "refuse": refuse, "freeze": freeze, "foreign": foreign, "shove": shove, "brown_out": brown_out,
         }  # fmt: skip
 

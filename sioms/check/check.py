@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import death_trials, defect_trials, golden, line_trials, motion_trials, refusal_trials, restart_trials
+from . import death_trials, defect_trials, end_trials, golden, line_trials, motion_trials, refusal_trials, restart_trials
 from .rigs import Rig
 from .station import Station, Unanswered
 from .trial import TRIES, Result, Trial, Verdict, attempt
@@ -16,6 +16,7 @@ from .trial import TRIES, Result, Trial, Verdict, attempt
 TRIALS: tuple[Trial, ...] = (
     *line_trials.TRIALS,
     *motion_trials.TRIALS,
+    *end_trials.TRIALS,
     *restart_trials.TRIALS,
     *refusal_trials.TRIALS,
     *defect_trials.TRIALS,

@@ -209,6 +209,8 @@ def _set_homing(station: Station) -> tuple[float, Client | None]:
     """Let a client of its own home the first axis; return the device's speed, and the client."""
     axis = station.rig.axes[0]
     with station.cell.open(f"{axis.node}.readonly") as seen:
+        if station.simulator is not None and "reference" in station.verbs:
+            station.simulator.tell("reference")
         client = station.start_client(HOME, axis.node)
         if not wait_for(lambda: seen.read().in_motion[0], 3.0):
             client.kill()

@@ -46,6 +46,13 @@ def state_of(station: Station) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
+def place_of(station: Station) -> float | None:
+    """Return where the device itself is, in its own unit; None when its simulator does not say."""
+    state = state_of(station)
+    place = state.get("place", state.get("position"))
+    return float(place) if isinstance(place, int | float) else None
+
+
 def usual_speed(station: Station, axis: Axis) -> float:
     """Run the axis at the rig's velocity and stop it; return the device's own speed meanwhile."""
     with station.cell.open(axis.node, "rw", timeout=5.0) as node:

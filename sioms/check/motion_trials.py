@@ -140,11 +140,18 @@ def _at_synch(station: Station, node: Any, axis: Axis) -> float:
     return 0.0
 
 
-def _homing(station: Station, node: Any, axis: Axis) -> float:
+def send_home(station: Station, node: Any) -> None:
+    """Begin a homing, of a device whose simulator has what it looks for near, if it can place it."""
+    if station.simulator is not None and "reference" in station.verbs:
+        station.simulator.tell("reference")
     try:
         node.home()
     except OSError as error:
         raise NotApplicable(f"it does not home: {error.strerror}") from None
+
+
+def _homing(station: Station, node: Any, axis: Axis) -> float:
+    send_home(station, node)
     if not wait_for(lambda: node.read().in_motion[0], 3.0):
         raise NotApplicable("its homing ended at once")
     time.sleep(0.1)

@@ -434,6 +434,8 @@ class Station:
         if self.daemon is None or self.daemon.process.poll() is not None:
             self.end_daemon()
             self.start_daemon()
+        if self.simulator is not None and "reference" in self.verbs:
+            self.simulator.tell("reference off")
         self.wait_fresh()
         self.cell.reset()
         for axis in self.rig.axes[:1]:

@@ -154,7 +154,7 @@ class Axis:
         self._since_s = 0.0
         self._was_pressed = self._pressed
         self._homes: tuple[float, float] | None = None
-        self._homes_back = self._arms = False
+        self._homes_back = self._done = self._arms = False
         self._switched_at = 0.0
         if self.p["config.startup_closed_loop_control"]:
             self.p["requested_state"] = CLOSED_LOOP
@@ -278,7 +278,7 @@ class Axis:
     def _begin_homing(self) -> None:
         p = self.p
         self._homes = p["controller.config.control_mode"], p["controller.config.input_mode"]
-        self._homes_back = False
+        self._homes_back = self._done = False
         if not p["min_endstop.config.enabled"]:
             self.fail(NO_ENDSTOP)
             self._homes, p["current_state"] = None, IDLE
@@ -291,19 +291,15 @@ class Axis:
 
     def _home(self) -> None:
         p = self.p
-        if not p["motor.is_armed"]:  # an error, or the last turn of the loop has let go
+        if p["motor.is_armed"]:
+            self._done = bool(p["controller.trajectory_done"]) if self._homes_back else self._pressed
+        if not p["motor.is_armed"] or (self._homes_back and self._done):  # an error has let go, or it is there
             self._end_homing()
-        elif not self._homes_back and self._pressed:
+        elif self._done:
             p["controller.input_vel"], p["motor.is_armed"], self._homes_back = 0.0, 0, True
             p["controller.config.control_mode"], p["controller.config.input_mode"] = POSITION, TRAP_TRAJ
             self._switched_at = self.position
             self._start_closed_loop()
-        elif self._homes_back and p["controller.trajectory_done"]:
-            self.origin = self.place
-            for name in ("input_pos", "pos_setpoint", "vel_setpoint"):
-                p[f"controller.{name}"] = 0.0
-            self._pos_updated, p["is_homed"] = True, 1
-            self._end_homing()
 
     def _turn_back(self) -> None:
         p, here = self.p, self._switched_at
@@ -311,8 +307,18 @@ class Axis:
         p["controller.vel_setpoint"], p["controller.trajectory_done"], self._pos_updated = 0.0, 0, True
 
     def _end_homing(self) -> None:
-        """Let go; the modes are as before, and the axis is idle."""
+        """Let go, at whatever speed the rotor has; the modes are as before, and the axis is idle.
+
+        ``done`` is still true from the switch until the board has looked at its trajectory for the first time: what
+        ends the homing in between sets the zero as well. The estimate counts from it a turn of the loop later, and that
+        turn may come behind the word that the axis is homed.
+        """
         p = self.p
+        if self._homes_back and self._done:
+            self.origin = self.place
+            for name in ("input_pos", "pos_setpoint", "vel_setpoint"):
+                p[f"controller.{name}"] = 0.0
+            self._pos_updated, p["is_homed"] = True, 1
         if p["controller.config.input_mode"] == VEL_RAMP:  # on its way to the switch
             p["controller.input_vel"] = 0.0
         if self._homes is not None:

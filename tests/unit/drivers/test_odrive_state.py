@@ -425,32 +425,93 @@ def test_homing_turns_back_from_the_switch_and_holds() -> None:
     assert watch.low > -2.1 and watch.high < 0.01 and watch.speed < 2.5
 
 
-@pytest.mark.parametrize("phase_us", range(0, 12000, 1000))
-def test_a_homed_axis_is_told_from_its_new_zero_on(phase_us: int) -> None:
-    """The board is idle and homed a turn of its loop before its estimate counts from the new zero: a poll that comes in
-    that turn has the old place. The turn is of 4 ms here, so that the lines of a poll fall into it on a slow line, too.
-    """
-    rig = homing_rig()
+def let_go_in_motion(**keys: Any) -> tuple[Joined, odrive.Axis]:
+    """Return a board whose homing ends in motion: its trajectory back from the switch is over before the rotor is."""
+    rig = homing_rig(**keys)
     rotor = rig.device.axes[0]
-    step, late = rotor.step, iter(range(4))
+    for name in ("accel", "decel"):
+        rotor.p[f"trap_traj.config.{name}_limit"] = 50.0
+    rotor.p["trap_traj.config.vel_limit"] = 10.0
+    rotor.p["controller.config.vel_ramp_rate"] = 50.0
+    rig.device.handlers()["switch"]("-2")
+    rig.poll(2)
+    return rig, rotor
+
+
+@pytest.mark.parametrize("phase_us", range(0, 12000, 1000))
+def test_a_homing_ends_once_the_loop_is_closed_and_the_axis_stands(phase_us: int) -> None:
+    """The board lets go when its homing ends, and is idle and homed a turn of its loop before its estimate counts from
+    the new zero. The turn is of 4 ms here, so that the lines of a poll fall into it on a slow line, too.
+    """
+    rig, rotor = let_go_in_motion()
+    step, late, ran_on = rotor.step, iter(range(4)), [0.0]
 
     def stepped(dt: float, powered: bool = True) -> None:
         old = rotor.p["encoder.pos_estimate"]
         step(dt, powered)
-        if rotor.p["is_homed"] and next(late, None) is not None:
-            rotor.p["encoder.pos_estimate"] = old
+        if rotor.p["is_homed"]:
+            ran_on[0] = max(ran_on[0], abs(rotor.position))
+            if next(late, None) is not None:
+                rotor.p["encoder.pos_estimate"] = old
 
     rotor.step = stepped
-    rig.device.handlers()["switch"]("-2")
-    rig.do(rig.unit.home(0))
-    told: list[float] = []
-    report = rig.unit.report
-    rig.unit.report = lambda place, *rest, **more: (told.append(float(place[0])), report(place, *rest, **more))
     rig.wait(1e-6 * phase_us)
-    for _ in range(6000):
-        rig.do(rig.unit.poll())
-        if not rig.unit._homes[0]:
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig._act()
+    for _ in range(300):
+        rig.poll()
+        if not rig.unit.bank.rows["in_motion"][0]:
             break
-        rig.wait(1e-3)
-    assert rotor.p["is_homed"]
-    assert told[-1] == pytest.approx(0.0, abs=0.05 * TURN)
+    assert rotor.p["current_state"] == CLOSED_LOOP and abs(rotor.velocity) < 0.02
+    assert ran_on[0] > 0.1, "a homing that ends at rest shows nothing"
+    assert rig.unit.bank.rows["position"][0] == pytest.approx(rotor.position * TURN, abs=2e-5)
+    assert rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
+    stood = rotor.place
+    rig.poll(50)
+    assert rotor.place == pytest.approx(stood, abs=2e-3)
+
+
+def test_a_stop_while_a_homed_axis_runs_on_brakes_it() -> None:
+    rig, rotor = let_go_in_motion(quick_stop="hold")
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig._act()
+    while not rig.unit._has_homed[0]:
+        rig.poll()
+    rig.unit.bank.stop([0], rig.unit.clock())
+    rig.poll(30)
+    assert rotor.p["current_state"] == CLOSED_LOOP and abs(rotor.velocity) < 0.02
+    assert not rig.unit.bank.rows["in_motion"][0]
+    assert not rig.unit.bank.rows["status"][0] & (AxisStatus.HOMED | AxisStatus.FAULT)
+
+
+def test_an_error_during_a_homing_is_no_rest() -> None:
+    rig, rotor = let_go_in_motion()
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig._act()
+    rig.poll(10)
+    rotor.fail(0x40)
+    while abs(rotor.velocity) > 0.03:
+        assert rig.unit.bank.rows["in_motion"][0]
+        rig.poll()
+    assert rig.unit.bank.rows["status"][0] & AxisStatus.FAULT
+    assert not rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
+
+
+def test_a_homing_stopped_at_the_switch_sets_a_zero_there_and_the_place_is_lost() -> None:
+    """axis.cpp, run_homing: ``done`` is true yet when the second loop ends before its first look."""
+    rig, rotor = let_go_in_motion()
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig._act()
+    for _ in range(3000):
+        if rotor._homes_back:
+            break
+        rig.wait(0.001)
+        if rig.sent and round(rig.now_s * 1000) % 20 == 0:
+            rig.device.take(b"u 0\n")
+    assert rotor._homes_back and not rotor.p["is_homed"]
+    rig.unit.bank.stop([0], rig.unit.clock())
+    rig.device.take(b"w axis0.requested_state 1\n")  # as the stop does, in this very turn
+    rig._act()
+    rig.poll(3)
+    assert rotor.p["is_homed"] and abs(rotor.p["encoder.pos_estimate"]) < 1
+    assert rig.unit.bank.rows["status"][0] & AxisStatus.POSITION_LOST
