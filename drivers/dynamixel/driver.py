@@ -205,7 +205,7 @@ class ServoUnit(AxesUnit):
         speed = image.get(PRESENT_VELOCITY, 4) / self._speed * math.copysign(1, self._per_unit)
         position = (image.get(PRESENT_VELOCITY + 4, 4) - self._axis.zero) / self._per_unit
         force = image.get(MOVING + 4, 2) * self._axis.current_unit * self._axis.force_per_ampere
-        moving = bool(image.get(MOVING, 1)) or speed != 0
+        moving = not self.rests(0, not image.get(MOVING, 1) and speed == 0)
         arrived = bool(image.get(MOVING + 1, 1) & 1)
         self._last = image
         one = np.array

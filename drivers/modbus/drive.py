@@ -23,7 +23,7 @@ from sioms.sdk.driver import Kit, LineUnit
 from sioms.sdk.exchange import DeviceError, Pause, Steps, while_wanted
 
 from .guard import Guard
-from .unit import MappedUnit, Values
+from .unit import MappedUnit, Read, Values
 
 SELDOM_NS = 1_000_000_000
 SEARCH_RESTS_NS = 3_000_000_000
@@ -77,6 +77,8 @@ class DriveUnit(LineUnit):
         self._plans = {
             group: self._mapped.plan(self._rmap.poll.get(group, ())) for group in ("always", "seldom", "open")
         }
+        # the place last: what is read while it brakes, or before its homing sets the zero, is not where it rests
+        self._plans["always"] = tuple(sorted(self._plans["always"], key=self._has_place))
         self._alarm_plan = self._mapped.plan([self._rmap.alarms.signal] if self._rmap.alarms else [])
         self._log = kit.log
         self._guard = Guard(mapped, log=kit.log)
@@ -166,6 +168,9 @@ class DriveUnit(LineUnit):
         return self._brake("fastest")
 
     # --- inside ----------------------------------------------------------------------------------
+
+    def _has_place(self, read: Read) -> bool:
+        return any(name == self._axis.position for name, *_ in read.parts)
 
     def _bring_to_rest(self) -> Steps:
         """Stop the drive until it reads at rest.
@@ -367,7 +372,7 @@ class DriveUnit(LineUnit):
                     self._mapped.gearing.travel_per_turn
                 )
         if done and self._homes and not moving:
-            self._homes = False
+            self._homes, self._last = False, None  # its zero is another one
         return moving, done
 
     def _velocity(self, values: Values, now_ns: int) -> float:
@@ -377,4 +382,6 @@ class DriveUnit(LineUnit):
         last, self._last = self._last, (now_ns, self._position)
         if last is None or now_ns <= last[0]:
             return 0.0
-        return (self._position - last[1]) / ((now_ns - last[0]) / 1e9)
+        velocity = (self._position - last[1]) / ((now_ns - last[0]) / 1e9)
+        has_new_zero = self._homes and abs(velocity) > self.bank.settings[0].velocity_max
+        return 0.0 if has_new_zero else velocity

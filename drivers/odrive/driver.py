@@ -168,7 +168,7 @@ class OdriveUnit(AxesUnit):
         for axis in range(n):
             (bits,), (state,), (arrived,), (turns[axis], speeds[axis]) = values[first + 4 * axis :][:4]
             states[axis] = int(state)
-            moving[axis] = abs(speeds[axis]) > self._standstill[axis]
+            moving[axis] = not self.rests(axis, bool(abs(speeds[axis]) <= self._standstill[axis]))
             done[axis], holds[axis] = bool(arrived), state == CLOSED_LOOP
             if self._homes[axis]:
                 yield from self._follow_homing(axis, int(state), int(bits), moving, done)

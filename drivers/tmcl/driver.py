@@ -273,11 +273,11 @@ class TmclUnit(AxesUnit):
         position, velocity = np.zeros(n), np.zeros(n)
         moving, done = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
         for axis, (motor, scale) in enumerate(zip(self._motors, self._scales, strict=True)):
-            # before the position, which the end of a search changes
+            # the position last: the end of a search changes it, and what was read while it braked is not where it rests
             searches = self._homes[axis] and (yield from self._ask(self._module.exchange(Op.RFS, 2, motor))) != 0
-            steps = yield from self._ask(self._module.get(Axis.ACTUAL_POSITION, motor))
             speed = yield from self._ask(self._module.get(Axis.ACTUAL_SPEED, motor))
             reached = yield from self._ask(self._module.get(Axis.POSITION_REACHED, motor))
+            steps = yield from self._ask(self._module.get(Axis.ACTUAL_POSITION, motor))
             position[axis] = steps / scale.per_unit
             velocity[axis] = speed / (scale.per_speed * scale.per_unit)
             moving[axis], done[axis] = speed != 0, bool(reached)

@@ -180,6 +180,7 @@ class AxesUnit(LineUnit):
         self._goes = [False] * len(settings)
         self._stood_ns = [0] * len(settings)
         self._raw = np.zeros(len(settings))
+        self._stood = [True] * len(settings)
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
@@ -244,6 +245,15 @@ class AxesUnit(LineUnit):
         self.bank.poll(now_ns, position, velocity, moving, done, fault, force, holds, self.block.asked_ns)
         self._guard(now_ns)
         self._look_for_short_moves(now_ns, moving, done)
+
+    def rests(self, axis: int, stands: bool) -> bool:
+        """Tell whether an axis rests: it stands now, and has stood at the look before. To be called once a poll.
+
+        For drives that tell a measured speed: a motor that swings about its target, or that is turned round, passes a
+        speed of 0 and goes on.
+        """
+        stood, self._stood[axis] = self._stood[axis], stands
+        return stands and stood
 
     def lose_place(self, axis: int, text: str) -> None:
         """Say that the drive does not know where this axis is, for a reason that only the family can see.
