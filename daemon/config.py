@@ -200,7 +200,9 @@ def parse(text: str, folder: str) -> tuple[Config | None, list[str]]:
     try:
         root = _document(text)
     except tomllib.TOMLDecodeError as error:
-        return None, [f"read configuration: {str(error)[0].lower() + str(error)[1:]}"]
+        from sioms.toml_errors import explained  # slow to import, and seldom needed
+
+        return None, [explained(text, error)]
     except RecursionError:
         return None, [f"read configuration: arrays or tables nested too deep; want at most {DEEPEST} levels"]
     except ValueError as error:  # an integer of more digits than Python converts

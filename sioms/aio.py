@@ -36,6 +36,7 @@ from .client.node_core import S
 from .client.node_verbs import AnalogVerbs, AxisVerbs, BinaryVerbs, NodeVerbs, select_nodes
 from .client.session import MarkerVerbs
 from .client.snapshot import AnalogSnapshot, AxisSnapshot, BinarySnapshot
+from .client.title import title
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Coroutine, Iterable, Mapping, Sequence
@@ -297,19 +298,19 @@ class AsyncWorkcell(Awaiting, WorkcellVerbs[AsyncMarker]):
     open.__doc__ = WorkcellVerbs._open.__doc__
 
 
-async def connect(path: str | None = None, name: str = "") -> AsyncWorkcell:
+async def connect(path: str | None = None, name: str | None = None) -> AsyncWorkcell:
     """Open a session with the daemon.
 
     Args:
         path: the daemon's socket, or ``zmq://HOST:PORT`` or ``zenoh://HOST:PORT`` of a gateway; None for $SIOMS_CELL,
             $SIOMS_SOCKET or the usual places. Connecting to a gateway takes some milliseconds, in which the loop does
             nothing else.
-        name: what this client calls itself.
+        name: what this client calls itself; None for how it was started.
     """
     path = path or cell_address()
     channel = connect_channel(path, waits=False)
     cell = AsyncWorkcell(channel, _Requests(channel, verbs.Cancel), path)
-    await cell._greet(name)
+    await cell._greet(title() if name is None else name)
     return cell
 
 
@@ -332,7 +333,7 @@ class _Together:
         return await asyncio.gather(*steps, return_exceptions=True)
 
     async def connect(self, address: str, name: str) -> AsyncWorkcell:
-        return await connect(address, name)
+        return await connect(address, name or None)
 
     def close(self) -> None:
         pass

@@ -62,6 +62,10 @@ def toml_of(text: str | bytes) -> dict[str, Any]:
         raise ValueError(f"arrays or tables nested too deep; want at most {DEEPEST} levels")
     try:
         table = tomllib.loads(plain)
+    except tomllib.TOMLDecodeError as error:
+        from .toml_errors import explained  # slow to import, and seldom needed
+
+        raise ValueError(explained(plain, error)) from None
     except RecursionError:
         raise ValueError(f"arrays or tables nested too deep; want at most {DEEPEST} levels") from None
     _check(table, "", 0)

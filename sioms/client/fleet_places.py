@@ -52,6 +52,10 @@ def read(path: str = "") -> dict[str, str]:
         cells = table.pop("cells", None)
         if table or not isinstance(cells, dict) or not all(isinstance(each, str) for each in cells.values()):
             raise ValueError('want a table [cells] with NAME = "ADDRESS", and nothing else')
+    except tomllib.TOMLDecodeError as error:
+        from sioms.toml_errors import explained  # slow to import, and seldom needed
+
+        raise OSError(errno.EINVAL, f"read the fleet {path}: {explained(data.decode(), error)}") from None
     except ValueError as error:
         raise OSError(errno.EINVAL, f"read the fleet {path}: {error}") from None
     return {checked(name): address for name, address in cells.items()}

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import sys
-
 from sioms.protocol.socketpath import cell_address
 
 from .cell_verbs import NodeEntry, WorkcellVerbs, is_part
@@ -13,6 +10,7 @@ from .connecting import CONNECT_S, connect_channel
 from .faces import Blocking, BlockingWaiter, run
 from .node import NODE, Node
 from .session import MarkerVerbs
+from .title import title
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -34,7 +32,7 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
     Args:
         path: the daemon's socket, or ``zmq://HOST:PORT`` or ``zenoh://HOST:PORT`` of a gateway; None for $SIOMS_CELL,
             $SIOMS_SOCKET or the usual places.
-        name: what this client calls itself in messages and lists.
+        name: what this client calls itself in messages and lists; None for how it was started.
         enough: tells of a daemon that does not answer at once whether the session is not needed any more.
 
     Raises:
@@ -51,8 +49,7 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
         path = path or cell_address()
         channel = connect_channel(path, CONNECT_S if enough is None else ENOUGH_LOOK_S)
         super().__init__(channel, BlockingWaiter(channel), path)
-        title = os.path.basename(sys.argv[0]) if name is None and sys.argv and sys.argv[0] else name or ""
-        run(self._greet(title, enough))
+        run(self._greet(title() if name is None else name, enough))
 
     def _waiter_of(self, channel: Channel) -> BlockingWaiter:
         return BlockingWaiter(channel)

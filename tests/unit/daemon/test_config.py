@@ -88,7 +88,7 @@ def test_all_errors_at_once_in_the_order_of_the_sections() -> None:
         ("[quota]\nmarkers = 1024", "[quota]"),
         ("[quota]\nsilent = 0", "silent"),
         ("[[emergency_stop]]\nnode = 'x'\nactive = 2", "active"),
-        ("x = [", "read configuration: "),
+        ("x = [", "line 1: x = [: want ]"),
         ("", "want at least one"),
         ("family = 'x'\n[signals]\na = { address = 1 }", "this is a register map, not a configuration"),
     ],
