@@ -320,8 +320,9 @@ class Board:
         def shove(speed: str, index: str = "0") -> None:
             self.axes[int(index)].shoved = float(speed)
 
-        return {"state": self.state, "error": error, "switch": switch, "reference": reference, "set": set_, "power_cycle": self.power_cycle,
-                "refuse": refuse, "freeze": freeze, "foreign": self.foreign, "shove": shove}  # fmt: skip
+        return {"state": self.state, "error": error, "switch": switch, "reference": reference, "set": set_,
+                "power_cycle": self.power_cycle, "refuse": refuse, "freeze": freeze,
+                "foreign": self.foreign, "shove": shove}  # fmt: skip
 
 
 def _xor(data: bytes) -> int:

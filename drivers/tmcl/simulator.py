@@ -9,9 +9,9 @@ mode; setting the actual position in position mode starts the motor. A restart f
 from 0 where the motor stands.
 
 Commands on standard input, beside those of the line: ``state [MOTOR]``, ``flags VALUE [MOTOR]`` (driver errors), ``ends
-LOW HIGH [MOTOR]``, ``reference [off]`` (the left switch near motor 0, or none), ``store`` (what was written to the EEPROM), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze
-[COUNT]``, ``foreign velocity|position VALUE [MOTOR]``, ``shove VELOCITY [MOTOR]``, ``brown_out`` (of an evaluation
-board's motor supply).
+LOW HIGH [MOTOR]``, ``reference [off]`` (the left switch near motor 0, or none), ``store`` (what was written to the
+EEPROM), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign velocity|position VALUE [MOTOR]``,
+``shove VELOCITY [MOTOR]``, ``brown_out`` (of an evaluation board's motor supply).
 """
 
 from __future__ import annotations
@@ -362,8 +362,9 @@ class Module:
                 motor.mover.halt()
 
         return {
-            "state": state, "flags": flags, "ends": ends, "reference": reference, "store": lambda: self.stored, "power_cycle": power_cycle,
-            "refuse": refuse, "freeze": freeze, "foreign": foreign, "shove": shove, "brown_out": brown_out,
+            "state": state, "flags": flags, "ends": ends, "reference": reference, "store": lambda: self.stored,
+            "power_cycle": power_cycle, "refuse": refuse, "freeze": freeze, "foreign": foreign, "shove": shove,
+            "brown_out": brown_out,
         }  # fmt: skip
 
 

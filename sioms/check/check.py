@@ -8,7 +8,16 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import death_trials, defect_trials, end_trials, golden, line_trials, motion_trials, refusal_trials, restart_trials
+from . import (
+    death_trials,
+    defect_trials,
+    end_trials,
+    golden,
+    line_trials,
+    motion_trials,
+    refusal_trials,
+    restart_trials,
+)
 from .rigs import Rig
 from .station import Station, Unanswered
 from .trial import TRIES, Result, Trial, Verdict, attempt

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from sioms.protocol.flags import AxisStatus, ControlMode
+from sioms.protocol.flags import AxisStatus
 
 from .device import place_of
 from .motion_trials import REST_S, SLOW, STILL_S, forward, run, send_home, wait_moving
@@ -103,6 +103,4 @@ ENDS: dict[str, Callable[[Station, Any, Axis], float]] = {
 }  # fmt: skip
 """Each brings a motion to its end, waits for it, and returns how fast the device was before in its own unit."""
 
-TRIALS = (
-    Trial("ends", "what is told at the end of a move, stop, homing and calibration", ends, wire=False),
-)
+TRIALS = (Trial("ends", "what is told at the end of a move, stop, homing and calibration", ends, wire=False),)
