@@ -32,7 +32,11 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--socket", metavar="PATH", help="where to listen, instead of the configured or default path")
     parser.add_argument("--check", action="store_true", help="check the configuration and exit")
     parser.add_argument("--log-level", default="info", choices=("debug", "info", "warning", "error"))
-    options = parser.parse_args(argv)
+    options, others = parser.parse_known_args(argv)
+    if others and not others[0].startswith("-") and options.config is None:
+        parser.error(f"{others[0]}: want --config {others[0]}")
+    if others:
+        parser.error(f"unrecognized arguments: {' '.join(others)}")
     if options.config is None:
         parser.error(f"no configuration was given; {_what_to_give()}")
     from .service import check, serve

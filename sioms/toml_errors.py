@@ -28,6 +28,7 @@ _WORDS = (
     ("Expected '=' after a key", "want KEY = VALUE, the key of letters, digits, _ and -, without blanks"),
     ("Expected ']'", "a table's line begins with [ and ends with ]"),
     ("Unclosed inline table", "what is between { and } stands on one line"),
+    ("Invalid initial character for a key", "want a key; what is between { and } stands on one line"),
     ("Unclosed array", "want ] at the end of what [ begins"),
     ("Unterminated string", "want the quotes closed"),
     ('Expected "\'"', "want the quotes closed"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from types import UnionType
@@ -48,7 +49,31 @@ def explain(
         return f"{where}: key {text.split('`')[1]} is missing"
     if "enum value" in text and (may := (words or {}).get(path.rpartition(".")[2].partition("[")[0])):
         return f"{where} = {text.split()[-1]}: want one of {', '.join(map(repr, may))}"
-    return f"{where}: {text[0].lower() + text[1:]}"
+    return f"{where}: {plain_words(text)}"
+
+
+_KINDS = {
+    "float": "a number", "int": "an integer", "str": "a text in quotes", "bool": "true or false",
+    "array": "a list [...]", "object": "a table {...}",
+}  # fmt: skip
+
+
+def plain_words(text: str) -> str:
+    """Say in the words of TOML what msgspec says in those of its types.
+
+    Example:
+        >>> plain_words("Expected `float | null`, got `str`")
+        'want a number, got a text in quotes'
+        >>> plain_words("Expected `int` <= 5")
+        'want an integer <= 5'
+    """
+
+    def kinds(found: re.Match[str]) -> str:
+        names = [name for name in found[1].split(" | ") if name != "null"]
+        return " or ".join(_KINDS.get(name, f"`{name}`") for name in names)
+
+    text = re.sub(r"`([^`]+)`", kinds, text)
+    return f"want {text.removeprefix('Expected ')}" if text.startswith("Expected ") else text[0].lower() + text[1:]
 
 
 def every_error(where: str, value: object, annotation: object) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 import msgspec
 
 from sioms.sdk.codec.modbus_pdu import MAX_READ_BITS, MAX_READ_REGISTERS, MAX_WRITE_REGISTERS
-from sioms.wording import did_you_mean
+from sioms.wording import did_you_mean, plain_words
 
 from .registers import RANGES, UNITS, Per, to_words, width
 from .regmap import Command, Item, Proof, RegisterMap, Signal, Write
@@ -58,7 +58,7 @@ def schema_problems(value: Any, expected: Any, place: str = "") -> list[str]:
     try:
         msgspec.convert(value, expected)
     except msgspec.ValidationError as error:
-        return [f"{place[:-1]} = {value!r}: {str(error).split(' - at')[0].lower()}"]
+        return [f"{place[:-1]} = {value!r}: {plain_words(str(error).split(' - at')[0])}"]
     return []
 
 

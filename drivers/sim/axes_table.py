@@ -6,6 +6,7 @@ No step of a tick is here.
 from __future__ import annotations
 
 import errno
+import re
 import zlib
 from collections.abc import Sequence
 from dataclasses import replace
@@ -152,7 +153,11 @@ def build(settings: SimAxesSettings) -> Built:
     names = [axis.name for axis in servos]
     plants, effects, laws = _twins(servos, [from_table(Motor, a.motor) for a in servos], tick_s)
     effects += _effects(settings, names)
-    motors = MotorBank(plants, tick_s, effects, laws=laws) if servos else None
+    try:
+        motors = MotorBank(plants, tick_s, effects, laws=laws) if servos else None
+    except ValueError as error:
+        named = re.sub(r"^build motor (\d+)", lambda found: f"axis {servos[int(found[1])].name}: motor", str(error))
+        raise ValueError(named) from None
     rotors = StepperBank([from_table(Stepper, a.stepper) for a in steppers], tick_s) if steppers else None
     return motors, rotors, [_axis_settings(axis, tick_s) for axis in axes]
 

@@ -248,6 +248,8 @@ class AxisSettings:
             value = getattr(self, name)
             if value is not None and not value > 0:
                 raise ValueError(f"axis {self.name}: {name} {value:g}; want a positive number")
+            if value == float("inf") and name != "following_error_max":
+                raise ValueError(f"axis {self.name}: {name} {value:g}; want what the axis can do")
         if not self.velocity_filter_s >= 0:
             raise ValueError(f"axis {self.name}: velocity_filter_s {self.velocity_filter_s:g}; want 0 or more")
         if not -1 < self.kp < 1:

@@ -64,11 +64,11 @@ def test_all_errors_of_nested_tables() -> None:
     table = {"axis": [{"name": 1, "mass": "x"}, {"mas": 2.0}], "rate": "fast", "raet": 1}
     assert every_error("d", table, Device) == [
         "d: unknown key raet; did you mean rate?",
-        "d.axis[0].name: expected `str`, got `int`",
-        "d.axis[0].mass: expected `float`, got `str`",
+        "d.axis[0].name: want a text in quotes, got an integer",
+        "d.axis[0].mass: want a number, got a text in quotes",
         "d.axis[1]: unknown key mas; did you mean mass?",
         "d.axis[1]: key name is missing",
-        "d.rate: expected `float`, got `str`",
+        "d.rate: want a number, got a text in quotes",
     ]
     optional = {"axis": [], "spare": {"name": "x", "mas": 1.0}, "more": [{"name": "x"}, {"nam": "x"}]}
     assert every_error("d", optional, Device) == [
@@ -109,15 +109,15 @@ node = "nosuch"
         ("[name]: unknown section", 1),
         ("[workcel]: unknown section; did you mean workcell?", 2),
         ("[workcell]: unknown key x; there are: name", 3),
-        ("[device.mod0].history: expected `int`, got `str`", 10),
+        ("[device.mod0].history: want an integer, got a text in quotes", 10),
         ("[device.mod0]: key rate is missing", 5),
-        ("[device.mod0].axis[0].motor.mass: expected `float`, got `str`", 13),
-        ("[device.mod0].axis[1].motor.mass: expected", 14),
+        ("[device.mod0].axis[0].motor.mass: want a number, got a text in quotes", 13),
+        ("[device.mod0].axis[1].motor.mass: want", 14),
         ("[device.mod0]: axis y: position_min 1 is not below position_max 0", 17),
         ("[device.mod0]: axis y: it has no encoder", 14),
         ("[device.mod0]: axis z: no such axis", 5),
         ("[device.mod0].axis[1].position_min = 2020-01-01: no key of a device takes a date", 17),
-        ("[workcell]: expected `object`, got `array`", 18),
+        ("[workcell]: want a table {...}, got a list [...]", 18),
         ("[[emergency_stop]] number 1: node = nosuch; want the name of one binary input", 20),
         ("[device.other]: not there", 0),
     ],

@@ -12,9 +12,13 @@ import pytest
 from sioms.tools.front import main as front
 
 
-def said_in(folder: Path) -> str:
+def said_in(folder: Path, *words: str) -> str:
     done = subprocess.run(
-        [sys.executable, "-P", "-m", "sioms.daemon.main"], cwd=folder, capture_output=True, text=True, timeout=60
+        [sys.executable, "-P", "-m", "sioms.daemon.main", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=60,
     )
     assert done.returncode == 2 and not done.stdout
     return done.stderr
@@ -25,6 +29,8 @@ def test_it_tells_the_file_that_init_wrote(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.chdir(tmp_path)
     front(["init", "cell.toml", "--name", "x"])
     assert "want --config cell.toml, which is in this folder" in said_in(tmp_path)
+    assert "cell.toml: want --config cell.toml" in said_in(tmp_path, "cell.toml")
+    assert "unrecognized arguments: -c cell.toml" in said_in(tmp_path, "-c", "cell.toml")
 
 
 def test_it_tells_configurations_alone(tmp_path: Path) -> None:

@@ -249,7 +249,8 @@ def test_a_model_of_another_kind_of_axis_is_refused(tmp_path):
     [
         ({"axis": []}, "axis: none given"),
         ({"axis": [{k: v for k, v in SERVO.items() if k != "motor"}]}, "neither or both"),
-        ({"axis": [SERVO | {"motor": {"mass": -1.0}}]}, "mass -1"),
+        ({"axis": [SERVO | {"motor": {"mass": -1.0}}]}, "axis x: motor: mass -1"),
+        ({"axis": [SERVO | {"acceleration_max": float("inf")}]}, "acceleration_max inf; want what the axis can do"),
         ({"axis": [SERVO | {"bandwidth_hz": 500.0}]}, "bandwidth_hz 500"),
         ({"axis": [SERVO], "beam": [{"boxes": [{"y": [0, 1]}]}]}, "no axis y"),
         ({"axis": [SERVO], "beam": [{"boxes": [{"x": [1, 0]}]}]}, "low first"),
