@@ -225,7 +225,7 @@ class Iio(tactile_nodes.FingerDriver, StreamDriver):
         """Return when each scan was taken [ns, CLOCK_MONOTONIC]; never later than now."""
         if TIMESTAMP not in raw:
             return [now_ns - round((scans - 1 - i) * 1e9 / self.settings.rate_hz) for i in range(scans)]
-        ahead_ns = time.time_ns() - time.monotonic_ns() if self._is_realtime else 0
+        ahead_ns = _wall_ahead_ns() if self._is_realtime else 0
         return [min(int(stamp) - ahead_ns, now_ns) for stamp in raw[TIMESTAMP]]
 
     def _is_new(self, stamp_ns: int) -> bool:
@@ -315,6 +315,17 @@ class _Finger(tactile_nodes.TactileNodes):
     ) -> tuple[AnalogBlock, ...]:  # fmt: skip
         """Sense one frame, as ``TactileNodes.take``."""
         return super().take((raw - self._offset) * self._factor, flags, stamp_ns, now_ns, begun_ns)
+
+
+def _wall_ahead_ns() -> int:
+    """Return how far the wall clock is ahead of the monotonic one, by the promptest of three looks: a process may be
+    kept waiting between the two.
+    """
+    looks = []
+    for _ in range(3):
+        before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+        looks.append((after_ns - before_ns, wall_ns - (before_ns + after_ns) // 2))
+    return min(looks)[1]
 
 
 def _blocks(settings: IioSettings, kit: Kit) -> tuple[AnalogBlock, _Finger | None]:

@@ -162,8 +162,9 @@ class Dummy:
         on = [channel for channel in TYPES if self.read(f"scan_elements/in_{channel}_en") == "1"]
         for channel in on:
             if channel == "timestamp":
-                ahead_s = 0.0 if self.read("current_timestamp_clock") == "monotonic" else time.time() - time.monotonic()
-                scan += bytes(-len(scan) % 8) + struct.pack("<q", round((at_s + ahead_s) * 1e9))
+                is_monotonic = self.read("current_timestamp_clock") == "monotonic"
+                ahead_ns = 0 if is_monotonic else min((_wall_ahead() for _ in range(3)), key=lambda look: look[0])[1]
+                scan += bytes(-len(scan) % 8) + struct.pack("<q", round(at_s * 1e9) + ahead_ns)
             else:
                 raw = self.raw[channel] & (1 << int(TYPES[channel][4:].split("/")[0])) - 1
                 scan += struct.pack("<H", raw)
@@ -185,6 +186,12 @@ class Dummy:
         on = [channel for channel in TYPES if self.read(f"scan_elements/in_{channel}_en") == "1"]
         words = ("buffer/enable", "buffer/length", "buffer/watermark", "current_timestamp_clock")
         return {"sent": self.sent, "lost": self.lost, "on": on, **{word: self.read(word) for word in words}}
+
+
+def _wall_ahead() -> tuple[int, int]:
+    """Return how long it took to look at both clocks, and how far the wall clock is ahead [ns]."""
+    before_ns, wall_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
+    return after_ns - before_ns, wall_ns - (before_ns + after_ns) // 2
 
 
 async def run() -> None:
