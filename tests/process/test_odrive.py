@@ -72,9 +72,13 @@ def test_moves_torques_homes_and_faults(start: Callable[..., Any], short_folder:
         x.home()
         x.wait_until_idle(20.0)
         assert x.read().status[0] & AxisStatus.HOMED
-        assert x.read().position[0] == pytest.approx(
-            0.0, abs=2e-3
-        )  # the board lets go at the switch: it runs on a little
+        # the board lets go in motion when its homing ends: told is where it has come to rest, its loop closed again
+        told, there = x.read(), wire.state("position", 0)
+        assert abs(wire.state("velocity", 0)) < 0.02 and wire.state("state", 0) == 8 and not told.in_motion[0]
+        assert told.position[0] == pytest.approx(there * 0.01, abs=1e-4)
+        assert 1e-3 < abs(told.position[0]) < 8e-3, "it runs on, by less than a turn"
+        time.sleep(0.3)
+        assert x.read().position[0] == pytest.approx(told.position[0], abs=1e-4)
         x.move(0.02)
         x.wait_until_idle(8.0)
         # emergency stop lets go; after a reset it moves again
