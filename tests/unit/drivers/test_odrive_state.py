@@ -386,9 +386,10 @@ def test_a_restart_while_the_link_is_lost_is_noticed_by_the_opening() -> None:
     run(rig, 1.0)  # and is not told again
 
 
-def homing_rig(**keys: Any) -> Joined:
+def homing_rig(torque: float = 10.0, **keys: Any) -> Joined:
     axis = {"name": "x", "number": 0, "travel_per_turn": TURN, "force_max": 400.0, "homing": True, **LIMITS}
     rig = Joined(Odrive, {"axis": [axis], **keys}, lambda clock: odrive.Board(clock=clock))
+    rig.device.axes[0].p["motor.config.torque_lim"] = torque
     rig.do(rig.unit.open())
     return rig
 
@@ -425,9 +426,9 @@ def test_homing_turns_back_from_the_switch_and_holds() -> None:
     assert watch.low > -2.1 and watch.high < 0.01 and watch.speed < 2.5
 
 
-def let_go_in_motion(**keys: Any) -> tuple[Joined, odrive.Axis]:
+def let_go_in_motion(torque: float = 10.0, **keys: Any) -> tuple[Joined, odrive.Axis]:
     """Return a board whose homing ends in motion: its trajectory back from the switch is over before the rotor is."""
-    rig = homing_rig(**keys)
+    rig = homing_rig(torque, **keys)
     rotor = rig.device.axes[0]
     for name in ("accel", "decel"):
         rotor.p[f"trap_traj.config.{name}_limit"] = 50.0
@@ -438,12 +439,13 @@ def let_go_in_motion(**keys: Any) -> tuple[Joined, odrive.Axis]:
     return rig, rotor
 
 
+@pytest.mark.parametrize("torque", [10.0, 1.0])
 @pytest.mark.parametrize("phase_us", range(0, 12000, 1000))
-def test_a_homing_ends_once_the_loop_is_closed_and_the_axis_stands(phase_us: int) -> None:
+def test_a_homing_ends_once_the_loop_is_closed_and_the_axis_stands(phase_us: int, torque: float) -> None:
     """The board lets go when its homing ends, and is idle and homed a turn of its loop before its estimate counts from
     the new zero. The turn is of 4 ms here, so that the lines of a poll fall into it on a slow line, too.
     """
-    rig, rotor = let_go_in_motion()
+    rig, rotor = let_go_in_motion(torque)
     step, late, ran_on = rotor.step, iter(range(4)), [0.0]
 
     def stepped(dt: float, powered: bool = True) -> None:
@@ -497,21 +499,31 @@ def test_an_error_during_a_homing_is_no_rest() -> None:
     assert not rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
 
 
-def test_a_homing_stopped_at_the_switch_sets_a_zero_there_and_the_place_is_lost() -> None:
-    """axis.cpp, run_homing: ``done`` is true yet when the second loop ends before its first look."""
+def until_the_switch(phase: int) -> tuple[Joined, odrive.Axis]:
+    """Return a board that homes, polled, and that has met its switch a millisecond ago, between two polls."""
     rig, rotor = let_go_in_motion()
+    rig.wait(0.001 * phase)
     rig.unit.bank.home([0], rig.unit.clock())
     rig._act()
-    for _ in range(3000):
-        if rotor._homes_back:
-            break
-        rig.wait(0.001)
-        if rig.sent and round(rig.now_s * 1000) % 20 == 0:
-            rig.device.take(b"u 0\n")
-    assert rotor._homes_back and not rotor.p["is_homed"]
+    while not rotor._homes_back:
+        rig.do(rig.unit.poll())
+        for _ in range(40):
+            if not rotor._homes_back:
+                rig.wait(0.001)
+    return rig, rotor
+
+
+def test_a_homing_stopped_at_the_switch_sets_a_zero_there_and_the_place_is_lost() -> None:
+    """axis.cpp, run_homing: ``done`` is true yet when the second loop ends before its first look."""
+    rig, rotor = next(
+        (rig, rotor) for rig, rotor in map(until_the_switch, range(0, 60, 7)) if rotor._done and rotor._arms
+    )
+    assert not rotor.p["is_homed"]
     rig.unit.bank.stop([0], rig.unit.clock())
     rig.device.take(b"w axis0.requested_state 1\n")  # as the stop does, in this very turn
     rig._act()
     rig.poll(3)
     assert rotor.p["is_homed"] and abs(rotor.p["encoder.pos_estimate"]) < 1
-    assert rig.unit.bank.rows["status"][0] & AxisStatus.POSITION_LOST
+    status = rig.unit.bank.rows["status"][0]
+    assert status & AxisStatus.POSITION_LOST and not status & AxisStatus.HOMED
+    assert "stopped while the board set its zero" in rig.unit.bank.fault_text(0)
