@@ -19,6 +19,7 @@ from importlib.util import find_spec
 from typing import Any, NoReturn
 
 from sioms.ending import leave
+from sioms.protocol.text import printable
 from sioms.safe_path import leave_working_directory
 
 
@@ -88,6 +89,10 @@ def main(words: Sequence[str] | None = None) -> int:
     else:
         for name, command in there.items():
             subparsers.add_parser(name, help=command.text)
+        if wanted and wanted == words[0]:
+            from sioms.wording import did_you_mean  # slow to import
+
+            parser.error(f"no command {printable(wanted, 80)}{did_you_mean(wanted, there)}; `sioms --help` lists all")
     try:
         args, rest = parser.parse_known_args(words)
         if rest:

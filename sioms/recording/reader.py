@@ -379,7 +379,10 @@ class Recording:
             OSError: ENOENT, it is not in the recording.
         """
         if name not in self.nodes:
-            raise OSError(2, f"{self.path}: no node {name} is recorded; there are: {', '.join(self.nodes) or 'none'}")
+            text = f"{self.path}: no node {name} is recorded"
+            if (whole := name.rpartition(".")[0]) in self.nodes:
+                raise OSError(2, f"{text}; want {whole}, which holds all of its channels")
+            raise OSError(2, f"{text}; there are: {', '.join(self.nodes) or 'none'}")
         return self.nodes[name]
 
     def slots(self, name: str) -> Iterator[NDArray[np.uint64]]:

@@ -301,7 +301,7 @@ def test_sioms_reloads(shell: Shell) -> None:
 def test_an_unknown_command(shell: Shell) -> None:
     result = shell("sioms lst")
     assert result.returncode == 2
-    assert "invalid choice" in result.stderr
+    assert "no command lst; did you mean list?" in result.stderr
 
 
 def test_monitor_prints_one_picture_into_a_pipe(shell: Shell) -> None:

@@ -99,7 +99,11 @@ def _analyse_axis(args: Args, say: Say) -> Any:
 
     if not args.data.exists():
         raise BadInputError(f"read {args.data}: no such file or folder")
-    nominal = read_model(args.model or args.data / "nominal.json")
+    model = args.model or args.data / "nominal.json"
+    if not (args.model or model.is_file()):
+        text = "no nominal model of the axis was given; want --model FILE"
+        raise BadInputError(f"{text}; `sioms reconcile describe {args.data}` drafts one")
+    nominal = read_model(model)
     session = read_data(args.data, nominal, args.columns)
     with ThreadPoolExecutor(args.jobs or os.cpu_count() or 1) as pool:
         options = Options(

@@ -181,3 +181,13 @@ def test_columns_of_a_matrix_are_read_by_their_number(tmp_path: Path) -> None:
     table = load_table(tmp_path / "run.npz")
     assert list(table.columns) == ["data(:,1)", "data(:,2)", "data(:,3)", "down(1,:)", "down(2,:)"]
     np.testing.assert_array_equal(table.columns["data(:,3)"], table.columns["down(2,:)"])
+
+
+@pytest.mark.parametrize("data", ["run.csv", "."])
+def test_without_a_model_it_is_told_how_to_get_one(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "run.csv").write_text("time [s],position [m],force [N]\n0,0,0\n")
+    monkeypatch.chdir(tmp_path)
+    assert main(["axis", data, "--quiet"]) == 2
+    assert f"want --model FILE; `sioms reconcile describe {data}` drafts one" in capsys.readouterr().err

@@ -87,6 +87,8 @@ def test_every_value_is_read(tmp_path: Path, is_packed: bool) -> None:
         assert recording.events() == events(5) and recording.damage == []
         with pytest.raises(OSError, match="no node mod1"):
             recording.table("mod1")
+        with pytest.raises(OSError, match=r"no node mod0\.x is recorded; want mod0, which holds all of its channels"):
+            recording.table("mod0.x")
 
 
 def test_of_a_file_cut_off_anywhere_all_whole_records_are_read(tmp_path: Path) -> None:
