@@ -100,7 +100,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         burst, others = bursts(s.ready.problem, formed.fit), rivals(s.searcher, formed, s.excited.pairs)
     verdict = on_halves(conclude(s, o, others, burst), s)
     # a log whose rows the controller has not made one by one is of an axis that has it nevertheless
-    model = replace(verdict.model, controller=nominal.controller, refine=nominal.refine, within={})
+    model = replace(verdict.model, controller=nominal.controller, refine=nominal.refine, within={}, swings_hz=0.0)
     if nominal.imposed:
         model = replace(model, inertia=nominal.inertia)
     return replace(verdict, model=model)

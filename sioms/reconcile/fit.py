@@ -73,9 +73,9 @@ class Problem:
         packed, falling = pack(model), _falls(model)
         temperature, out = 0.0, []
         for r in self.session.records:
-            run = track(model, r.position, r.force, self.noise, temperature, packed, external=r.external)
+            run = track(model, r.position, r.force, self.noise, temperature, packed, external=r.external, bends=r.bends)
             if falling and (level := self._lost(run)) < np.inf:
-                run = track(model, r.position, r.force, self.noise, temperature, packed, level, r.external)
+                run = track(model, r.position, r.force, self.noise, temperature, packed, level, r.external, r.bends)
             temperature = run.end_temperature if self.session.continuous else 0.0
             out.append(run)
         return out

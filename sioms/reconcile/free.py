@@ -209,10 +209,10 @@ def _start(model: AxisModel, packed: Packed, segment: Segment) -> tuple[Array, A
 
 def _run(packed: Packed, segment: Segment, start: Array, force: Array | None = None) -> Run:
     part = slice(segment.start, segment.stop)
-    outer = segment.record.external
-    known = None if outer is None else outer[part]
+    record = segment.record.cut(part.start, part.stop)
+    known = record.external
     both = known if force is None else force if known is None else known + force
-    return released(packed, segment.record.force[part], start, both)
+    return released(packed, record.force, start, both, record.bends)
 
 
 def _pushed(

@@ -65,7 +65,7 @@ def _late_errors(problem: Problem, model: AxisModel, states: Sequence[State]) ->
         m, seen = applied(model, r, states[i]) if states else (model, r)
         start = states[i].heat if states else heat
         part = slice(half(problem, r), problem.span(r).stop)
-        run = track(m, seen.position, seen.force, problem.noise, start, external=seen.external)
+        run = track(m, seen.position, seen.force, problem.noise, start, external=seen.external, bends=seen.bends)
         windows.append(run.innovation[part] * unit)
         if model.controller is not None and seen.command is not None:
             run = replay(m, seen, start)

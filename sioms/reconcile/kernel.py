@@ -184,7 +184,8 @@ def march(
     Args:
         command, measured, force_in: shape (n,); ``command`` is read when closed, ``measured`` when tracking;
             ``force_in`` is the whole force when tracking, and what is added to the controller's when closed.
-        external: force on the axis beside the drive's, shape (n,).
+        external: force on the axis beside the drive's, and how the command to the drive goes within the sample, or this
+            force where there is no drive, as of ``Record.bends``; shape (n, 3).
         gain: corrections of place and speed of the motor, and of the load, by the innovation: in contact, and out of
             it; shape (8,).
         lost: innovation at which, held for ``PATIENCE`` samples, the speed is taken from the measurement.
@@ -265,6 +266,9 @@ def march(
             ua = u
             if delay > 0.0:
                 ua = delayed(u_all, held, i, s * h, (s + 1) * h, delay, dt)
+            if external[i, 1] != 0.0 or external[i, 2] != 0.0:
+                a, b = 2.0 * s / sub - 1.0, 2.0 * (s + 1) / sub - 1.0
+                ua += external[i, 1] * 0.5 * (a + b) + external[i, 2] * 0.5 * (a * a + a * b + b * b - 1.0)
             if slew > 0.0:
                 ua, slewed = ramped(slewed, ua, slew, h)
             if lag > 0.0:
@@ -286,7 +290,7 @@ def march(
                 level = 0.0
             elif dry and level * v <= 0.0:
                 level = sign * friction(levels, pl, wave, x, v, ua, temp)
-            base = drive + external[i] + acting - hyst
+            base = drive + external[i, 0] + acting - hyst
             link = coupling(plant, x - xl, v - vl) if two else 0.0
             a0 = (base - viscous * v - level - link) * per_mass
             vp = v + 0.5 * h * a0

@@ -52,6 +52,7 @@ class AxisModel:
         refine: base parameters ("inertia", "viscous") that are uncertain and fitted along, not named.
         driven: False where the axis has no drive: it swings or coasts freely, or only ``external`` moves it.
         imposed: another machine imposes the motion, and the force is what that takes, as on a friction rig.
+        swings_hz: how fast the motion is that was recorded, and steps of the simulation have to follow; 0: nobody said.
         within: bounds of numbers in ``refine`` while effects are searched; one without is only kept from zero.
     """
 
@@ -70,6 +71,7 @@ class AxisModel:
     name: str = "axis"
     driven: bool = True
     imposed: bool = False
+    swings_hz: float = 0.0
     within: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     @property

@@ -21,7 +21,7 @@ from sioms.reconcile.fit import SKIP, SKIP_S, Mapper, Problem, block_ids
 from sioms.reconcile.imposed import carried
 from sioms.reconcile.locked import INTERPOLATION, read_right
 from sioms.reconcile.model import AxisModel
-from sioms.reconcile.noise import drive_noise, observer, sensor_noise
+from sioms.reconcile.noise import drive_noise, moves_at, observer, sensor_noise
 from sioms.reconcile.polled import evened
 from sioms.reconcile.rate import trusted_blindly
 from sioms.reconcile.records import Session
@@ -129,6 +129,8 @@ def _prepared(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     session, left_out = usable(session, searched(session), nominal)
     notes += left_out
     notes += check(session, nominal)
+    seen, dt = searched(session), nominal.sample_time_s
+    nominal = replace(nominal, swings_hz=moves_at(seen, sensor_noise(seen, nominal.resolution), dt))
     if session.final:
         check(Session(session.final), nominal)
     if polled:
@@ -136,7 +138,7 @@ def _prepared(session: Session, nominal: AxisModel, o: Options) -> Prepared:
     if session.loop_time_s is not None:
         late = 0.5 * session.loop_time_s / nominal.sample_time_s
         if late < OWN_PACE:
-            return _read(session, nominal, notes, o, Sampling(late))
+            return _read(session, nominal, notes, o, Sampling(late, curved=True))
         return _channels(session, nominal, notes, o)
     ready = replace(_channels(session, nominal, notes, o), held=not runs_the_loop(session, nominal))
     if (other := reread(ready, ready.model, (), o)) is not None:
@@ -178,7 +180,7 @@ def reread(ready: Prepared, model: AxisModel, frozen: Sequence[str], o: Options)
     if sampling is None:
         return None
     notes = [*ready.notes, sampling.text(model.sample_time_s)]
-    other = _read(problem.session, ready.nominal, notes, o, sampling)
+    other = _read(problem.session, ready.nominal, notes, o, replace(sampling, curved=True))
     return replace(other, names=tuple(n for n in other.names if n not in TIMES), blind=ready.blind)
 
 

@@ -25,6 +25,8 @@ class Record:
         filled: True where a sample was lost and is interpolated, or None.
         feedforward: the part of ``force`` that is no feedback (a feed-forward, an injected test signal), or None.
         external: known force that acts on the axis beside the drive's, held over each sample, [{F}], or None.
+        bends: how the known forces go within each sample about their means: what their slope and their bend make at its
+            end, of the first two Legendre polynomials, shape (n, 2), [{F}], or None where they are held.
         trust: factor on the residual of each sample, less than 1 where the force is known to worse than the drive's
             noise, or None.
     """
@@ -39,6 +41,7 @@ class Record:
     filled: NDArray[np.bool_] | None = None
     feedforward: Array | None = None
     external: Array | None = None
+    bends: Array | None = None
     trust: Array | None = None
 
     def __len__(self) -> int:

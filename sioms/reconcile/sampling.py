@@ -45,10 +45,12 @@ class Sampling:
         late: half a period of the loop, in samples of the log: the force comes so late after the points of the log;
             below 0 the log is late with it. None: the row after the present one holds the force.
         left: share of the squares that the force held over its sample leaves.
+        curved: how the force goes within a sample counts, too; of rows that were polled that is not known.
     """
 
     late: float | None
     left: float = 1.0
+    curved: bool = False
 
     def text(self, sample_time_s: float) -> str:
         """Say it."""
@@ -69,7 +71,8 @@ class Sampling:
 
 
 def read_as(session: Session, sampling: Sampling) -> Session:
-    """Return the session with the mean force of every sample [{F}] in the place of the logged one, in all its records.
+    """Return the session with the mean force of every sample [{F}] in the place of the logged one, and how it goes
+    within the sample, in all its records.
 
     What the loop makes, and the drive's current with it, comes ``sampling.late``; a force from outside is nobody's loop
     and is read as it was measured.
@@ -80,12 +83,16 @@ def read_as(session: Session, sampling: Sampling) -> Session:
 
     def read(r: Record) -> Record:
         late = sampling.late
+        outer = None if late is None else 0.0
         return replace(
             r,
             force=_mean(r.force, late),
             force_measured=mean(r.force_measured, late),
             feedforward=mean(r.feedforward, late),
-            external=mean(r.external, None if late is None else 0.0),
+            external=mean(r.external, outer),
+            bends=None
+            if late is None or not sampling.curved
+            else _bends(r.force, late) + (0.0 if r.external is None else _bends(r.external, 0.0)),
         )
 
     halves = tuple(read_as(half, sampling) for half in session.halves)
@@ -99,9 +106,18 @@ def _mean(signal: Array, late: float | None) -> Array:
     """
     if late is None:
         return np.append(signal[1:], signal[-1])
-    n = len(signal)
-    curve = CubicSpline(np.arange(-1, n + 1), np.concatenate([signal[:1], signal, signal[-1:]]))
-    return np.asarray(np.diff(curve.antiderivative()(np.arange(n + 1) - late)))
+    return np.asarray(np.diff(_curve(signal).antiderivative()(np.arange(len(signal) + 1) - late)))
+
+
+def _bends(signal: Array, late: float) -> Array:
+    """First two Legendre coefficients of that spline in every sample, shape (n, 2)."""
+    at, weight = np.polynomial.legendre.leggauss(4)
+    inside = _curve(signal)(np.arange(len(signal))[:, None] + 0.5 * (at + 1.0) - late)
+    return np.asarray(inside @ np.stack([1.5 * weight * at, 1.25 * weight * (3.0 * at**2 - 1.0)], axis=1))
+
+
+def _curve(signal: Array) -> CubicSpline:
+    return CubicSpline(np.arange(-1, len(signal) + 1), np.concatenate([signal[:1], signal, signal[-1:]]))
 
 
 def trusted(problem: Problem, model: AxisModel) -> Problem:

@@ -104,7 +104,7 @@ def estimate(problem: Problem, model: AxisModel, record: Record, stop: int, heat
 
     def residual(s: State) -> Array:
         m, r = applied(model, record, s)
-        e = track(m, r.position, r.force, problem.noise, s.heat, external=r.external).innovation[span]
+        e = track(m, r.position, r.force, problem.noise, s.heat, external=r.external, bends=r.bends).innovation[span]
         return np.clip(np.nan_to_num(e / problem.noise.innovation, nan=1e6), -1e6, 1e6)
 
     first = r = residual(state)

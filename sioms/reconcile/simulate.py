@@ -25,6 +25,8 @@ IDLE = (0.0,) * 8
 #: A record begins in motion that at first makes more way than this share of the largest speed would. Its start is
 #: fitted over so many periods of an elastic transmission, and samples.
 MOVING, PERIODS, FEWEST = 0.01, 4.0, 40
+#: Phase [rad] of the recorded motion that a step may take, and steps of a sample at most.
+PHASE, MOST = 0.05, 32
 #: Numbers of a start, and how many memories of an observer tell the speed in it.
 START, MEMORIES = 7, 2.0
 
@@ -87,7 +89,11 @@ def pack(model: AxisModel, substeps: int = 0) -> Packed:
         plant,
         {s: addresses(f) for s, f in functions.items()},
         {s: np.array(r).reshape(-1, ROW) for s, r in rows.items()},
-        substeps or _steps(max((e.mechanism.substeps for e, _ in effects), default=2), model.sample_time_s),
+        substeps
+        or max(
+            _steps(max((e.mechanism.substeps for e, _ in effects), default=2), model.sample_time_s),
+            _followed(model.swings_hz * model.sample_time_s),
+        ),
     )
 
 
@@ -109,13 +115,18 @@ def _steps(most: int, sample_time_s: float) -> int:
     return min(most, math.ceil(most * sample_time_s / 1e-3 - 1e-9))
 
 
+def _followed(periods: float) -> int:
+    """Steps in a sample in which a motion makes so many periods: z of phase in a step make a spring z^2/12 stiffer."""
+    return min(math.ceil(2.0 * math.pi * periods / PHASE), MOST)
+
+
 def _march(
     p: Packed,
     closed: bool,
     command: Array,
     measured: Array,
     force: Array | None,
-    external: Array | None,
+    external: Array,
     ctl: Array,
     gain: tuple[float, ...],
     start: Array,
@@ -129,7 +140,7 @@ def _march(
         command,
         measured,
         nothing if force is None else np.ascontiguousarray(force, dtype=np.float64),
-        nothing if external is None else np.ascontiguousarray(external, dtype=np.float64),
+        external,
         ctl,
         p.plant,
         p.functions[f],
@@ -167,7 +178,18 @@ def simulate(model: AxisModel, command: Array, temperature: float = 0.0, substep
     """
     command = np.ascontiguousarray(command, dtype=np.float64)
     start = np.array([model.start_position, 0.0, temperature, 0.0, 0.0, 0.0, 0.0])
-    return _march(pack(model, substeps), True, command, command, None, None, controller_row(model), IDLE, start)
+    outer = _outer(len(command), None)
+    return _march(pack(model, substeps), True, command, command, None, outer, controller_row(model), IDLE, start)
+
+
+def _outer(count: int, external: Array | None, bends: Array | None = None) -> Array:
+    """Lay a force beside the drive's out as the kernel reads it, shape (count, 3)."""
+    out = np.zeros((count, 3))
+    if external is not None:
+        out[:, 0] = external
+    if bends is not None:
+        out[:, 1:] = bends
+    return out
 
 
 def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
@@ -184,7 +206,7 @@ def replay(model: AxisModel, record: Record, temperature: float = 0.0) -> Run:
     start = np.array([_true_place(p.plant, y[0]), 0.0, temperature, command[0] - y[0], held, 0.0, 0.0])
 
     def run(at: Array, n: int) -> Run:
-        force, outer = (None if a is None else a[:n] for a in (added, record.external))
+        force, outer = None if added is None else added[:n], _outer(len(command), record.external)[:n]
         return _march(p, True, command[:n], command[:n], force, outer, controller_row(model), IDLE, at)
 
     if _moves(y, model):
@@ -230,7 +252,7 @@ def _set_going(
     p: Packed,
     y: Array,
     force: Array,
-    external: Array | None,
+    external: Array,
     gain: tuple[float, ...],
     start: Array,
     steps: Array,
@@ -241,8 +263,7 @@ def _set_going(
     """
 
     def innovation(at: Array) -> Array:
-        outer = None if external is None else external[:n]
-        return _march(p, False, y[:n], y[:n], force[:n], outer, np.zeros(k.CTL_SIZE), gain, at).innovation
+        return _march(p, False, y[:n], y[:n], force[:n], external[:n], np.zeros(k.CTL_SIZE), gain, at).innovation
 
     first = innovation(start)
     moved = np.stack([innovation(start + step) - first for step in steps], axis=1)
@@ -288,6 +309,7 @@ def track(
     packed: Packed | None = None,
     lost: float = np.inf,
     external: Array | None = None,
+    bends: Array | None = None,
 ) -> Run:
     """Drive the plant with a recorded force while an observer holds it on the recorded position.
 
@@ -297,11 +319,12 @@ def track(
         noise: for which the observer is made; None: nothing holds the plant.
         lost: innovation beyond which the model has lost the measurement and takes its speed from it, [{x}].
         external: force on the axis beside the drive's, shape (n,), [{F}]; None: none.
+        bends: how the forces go within each sample, as of ``Record``.
 
     Returns:
         The run; ``innovation`` is what the model could not predict.
     """
-    y = np.ascontiguousarray(position, dtype=np.float64)
+    y, outer = np.ascontiguousarray(position, dtype=np.float64), _outer(len(position), external, bends)
     p = packed or pack(model)
     start = np.array(
         [
@@ -314,17 +337,20 @@ def track(
     pair = linked(p)
     gain = IDLE if noise is None else corrections(noise, pair, model.sample_time_s)
     if noise is not None and (unknown := _unknown_at_first(p, y, noise, pair, model)) is not None:
-        start = _set_going(p, y, force, external, gain, start, *unknown)
-    return _march(p, False, y, y, force, external, np.zeros(k.CTL_SIZE), gain, start, lost)
+        start = _set_going(p, y, force, outer, gain, start, *unknown)
+    return _march(p, False, y, y, force, outer, np.zeros(k.CTL_SIZE), gain, start, lost)
 
 
-def released(packed: Packed, force: Array, start: Array, external: Array | None = None) -> Run:
+def released(
+    packed: Packed, force: Array, start: Array, external: Array | None = None, bends: Array | None = None
+) -> Run:
     """Drive the plant with a recorded force while nothing holds it.
 
     Args:
         force: command to the drive, shape (n,), held over each sample, [{F}].
         start: as the time step reads it, shape (7,).
         external: force on the axis beside the drive's, shape (n,), [{F}]; None: none.
+        bends: how the forces go within each sample, as of ``Record``.
     """
-    still = np.zeros(len(force))
-    return _march(packed, False, still, still, force, external, np.zeros(k.CTL_SIZE), IDLE, start)
+    still, outer = np.zeros(len(force)), _outer(len(force), external, bends)
+    return _march(packed, False, still, still, force, outer, np.zeros(k.CTL_SIZE), IDLE, start)
