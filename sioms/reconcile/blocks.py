@@ -102,6 +102,26 @@ def intervals(fit: Fitted, ids: NDArray[np.int64], level: float = 0.95) -> Array
     return np.asarray(student.ppf(0.5 + 0.5 * level, freedom) * np.sqrt(variance))
 
 
+def combined(fit: Fitted, ids: NDArray[np.int64], slopes: Array, level: float = 0.95) -> Array:
+    """Half-widths of the intervals of what the numbers of a fit add up to, shape (m,): the larger of the jackknife's
+    and that of white noise.
+
+    Args:
+        slopes: how each of it goes with the numbers, in units of their scale, shape (m, k).
+    """
+    h, g, _ = _normal(fit, ids)
+    n, (b, k) = len(fit.residual), g.shape
+    if k == 0 or b < LEAST_MODERATED:
+        return np.full(len(slopes), np.inf)
+    total = h.sum(0) + 1e-9 * np.trace(h.sum(0)) / k * np.eye(k)
+    moves = np.stack([np.linalg.solve(total - inside, -own) for inside, own in zip(h, g, strict=True)]) @ slopes.T
+    jackknife = (b - 1) / b * np.sum((moves - moves.mean(0)) ** 2, axis=0)
+    white = (
+        float(fit.residual @ fit.residual) / max(n - k, 1) * np.sum(slopes.T * np.linalg.solve(total, slopes.T), axis=0)
+    )
+    return np.asarray(student.ppf(0.5 + 0.5 * level, b - 1) * np.sqrt(np.maximum(jackknife, white)))
+
+
 def formal(fit: Fitted, level: float = 0.95) -> Array:
     """Half-widths of the intervals of least squares under white noise, in units of the parameters' scale, shape (k,).
 

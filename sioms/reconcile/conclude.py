@@ -17,7 +17,7 @@ from sioms.reconcile.controlled import foreign
 from sioms.reconcile.disturbance import disturbance
 from sioms.reconcile.effect import Array, Over
 from sioms.reconcile.effects import known
-from sioms.reconcile.effects.smooth import CONSTANT, LAWS, SIDE
+from sioms.reconcile.effects.smooth import CONSTANT, LAWS, OPPOSING, SIDE
 from sioms.reconcile.engine.evidence import alternative, outcome
 from sioms.reconcile.evidence import describe, spans_of
 from sioms.reconcile.excitation import Gate
@@ -31,6 +31,7 @@ from sioms.reconcile.locate import Spectrum, locate, spectra
 from sioms.reconcile.locked import locked
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import effective_samples
+from sioms.reconcile.opposing import at_rest, friction_told, likened
 from sioms.reconcile.plausible import leans
 from sioms.reconcile.prepare import TIMES, Options, Prepared, searched
 from sioms.reconcile.rate import SAMPLE_TIME, instead, remark
@@ -69,6 +70,10 @@ HELD = (
 OTHER_LAW = "another_law_of_the_drive"
 OF_DRIVE = "measured and commanded force do not tell {} from another law of the drive"
 TO_TELL = "{} would be told from {} by {}, with less noise of the force"
+AT_REST = (
+    "the level of Coulomb friction is that of all friction, extrapolated to rest; in model.toml a law without a name "
+    "has a part of it"
+)
 #: Steps of the last fit.
 LAST = 12
 #: The effect that another sample time looks like.
@@ -147,6 +152,11 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes.append(_of_bursts(ready.problem, found.fit, burst))
     elif beyond:
         notes.append(_of_much(ratio, s.share))
+    if not judged.refusals:
+        notes += likened(s.searcher, found)
+        if any(e.name in OPPOSING for e in terms):
+            notes += [text for text in (friction_told(whole, fit),) if text]
+            named = [_at_rest(e, whole, fit, notes) for e in named]
     if ready.blind:
         notes.insert(0, remark(nominal))
     tried = refused(named, leaning, bool(judged.refusals), beyond)
@@ -320,6 +330,18 @@ def _alternatives(
     return tuple(sets)
 
 
+def _at_rest(e: NamedEffect, whole: Problem, fit: Fit, notes: list[str]) -> NamedEffect:
+    """Give Coulomb friction beside a law without a name the level that friction has when extrapolated to rest: how much
+    of it the law takes is a convention.
+    """
+    if e.name != "coulomb" or (told := at_rest(whole, fit)) is None:
+        return e
+    (level, *rest), (value, half) = e.parameters, told
+    level = replace(level, value=value, low=value - half, high=value + half)
+    notes.append(AT_REST)
+    return replace(e, parameters=(level, *rest))
+
+
 def _rated(e: NamedEffect, nominal: AxisModel, model: AxisModel) -> NamedEffect:
     """Tell beside a payload which sample time would do the same."""
     if e.name != PAYLOAD:
@@ -425,7 +447,9 @@ def _traces(problems: tuple[Problem, Problem], models: tuple[AxisModel, AxisMode
         own: list[Array] = []
         for r, tracked in zip(problem.session.records, problem.runs(model), strict=True):
             if model.controller is None or r.command is None:
-                own.append(r.force + tracked.innovation * unit)
+                left = r.force + tracked.innovation * unit
+                left[: problem.skip] = np.nan  # in which the observer finds the state
+                own.append(left)
                 continue
             run = replay(model, r, heat)
             heat = run.end_temperature

@@ -31,6 +31,7 @@ from sioms.reconcile.plausible import (
     unspecific,
     vacant,
 )
+from sioms.reconcile.rules import negligible
 from sioms.reconcile.screen import screen
 from sioms.reconcile.thresholds import AXIS, CLEAR, GAIN, LOOSE, PERIODIC_SURE, SPECIFIC, SURE, WAVES
 from sioms.reconcile.variation import accompanied, exchanged, named
@@ -283,9 +284,22 @@ class Searcher(Search[AxisModel]):
         return unspecific(name, {n: t.saved.share for n, t in tried.items()})
 
     def order(self, name: str, tried: Tried[AxisModel], best: Fit) -> tuple[bool, int, float]:
-        """Go by the number of parameters; a named effect goes before a nameless term that does no better."""
+        """Go by the number of parameters, less those that may leave beside it; a named effect goes before a nameless
+        term that does no better.
+        """
         names = name.split(AND)
-        return any(n not in library() for n in names), sum(map(size, names)), -tried.saved.share
+        count = sum(map(size, names)) - self._spared(tried, names)
+        return any(n not in library() for n in names), count, -tried.saved.share
+
+    def _spared(self, tried: Tried[AxisModel], names: Sequence[str]) -> int:
+        """Return how many parameters a candidate makes dispensable: the most of an effect that may leave beside it."""
+        most = 0
+        for name in [n for n in tried.fit.model.effects if n not in (*self.frozen, *names)]:
+            without = self.bare(tried.fit, name)
+            gap = self.lost(self.loss(without), tried.losses)
+            if negligible(gap.share, gap.errors) and self.may_leave(without, tried.fit):
+                most = max(most, size(name))
+        return most
 
     def _good(
         self, tried: dict[str, Tried[AxisModel]], fit: Fit, losses: Array

@@ -134,6 +134,8 @@ LAWS = (
          "F = -s(u) sign(v), s a broken line", by_force, Over.FORCE,
          ("{F}", Ref.FORCE, "{F}"), ("load_friction", "load_square_friction"), Slot.FRICTION),
 )  # fmt: skip
+#: Laws that share friction out with what has a name by convention alone.
+OPPOSING = tuple(TERM_PREFIX + n for n in ("law_of_speed", "drag_by_place", "friction_by_place", "friction_by_force"))
 #: What has the constant of a law, which is zero in the middle by convention alone.
 CONSTANT = {
     "term_law_of_place": "offset",

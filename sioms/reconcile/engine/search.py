@@ -295,7 +295,8 @@ class Search(ABC, Generic[M]):
             gap = self.lost(t.losses, best.losses)
             return negligible(gap.share, gap.errors)
 
-        return min((n for n, t in good.items() if t is best or near(t)), key=lambda n: self.order(n, good[n], best.fit))
+        about = [n for n, t in good.items() if t is best or near(t)]
+        return about[0] if len(about) == 1 else min(about, key=lambda n: self.order(n, good[n], best.fit))
 
     def eliminate(self, fit: Fit[M], losses: Array, steps: list[ladder.Step[M]]) -> tuple[Fit[M], Array]:
         """Let effects leave that no longer save their share; the last stays."""
