@@ -80,6 +80,8 @@ def _gap_picture(figure: Figure, gaps: Sequence[Gap]) -> Figure:
 def _trace_picture(figure: Figure, v: AxisVerdict) -> Figure:
     shown = v.traces[:4]
     floor = next((g.floor for g in reversed(v.gaps) if g.channel.startswith("force")), np.nan)
+    loop = any("closed loop" in g.channel for g in v.gaps)
+    what = "simulated - measured" if loop else "what short windows leave, as a force"
     rows = figure.subplots(len(shown), 1, squeeze=False)[:, 0]
     for ax, t in zip(rows, shown, strict=True):
         step = max(len(t.time_s) // 3000, 1)
@@ -89,7 +91,7 @@ def _trace_picture(figure: Figure, v: AxisVerdict) -> Figure:
             (t.before - t.measured)[::step],
             color="#c50",
             lw=0.7,
-            label="simulated - measured, before",
+            label=f"{what}, before",
         )
         ax.plot(t.time_s[::step], (t.after - t.measured)[::step], color="#08a", lw=0.7, label="after")
         for side in (-1.0, 1.0) if np.isfinite(floor) else ():
