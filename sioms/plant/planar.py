@@ -428,19 +428,19 @@ class World:
             ex, ey = bx - ax, by - ay
             along = (u - ax) * ex + (v - ay) * ey
             square = ex * ex + ey * ey
+            if came > 0 and along < 0.0:  # a corner between two sides, of which it sees one from behind if it is sharp
+                fx, fy = ax, ay
+                break
+            if came < 0 and along > square:
+                fx, fy = bx, by
+                break
             if seen < count and ex * (v - ay) - ey * (u - ax) > 0.0:  # it shows this side its back
                 came, at, seen = 0, (at + 1) % count, seen + 1
                 continue
             if along < 0.0:
-                if came > 0:
-                    fx, fy = ax, ay
-                    break
                 came, at = -1, (at - 1) % count
                 continue
             if along > square:
-                if came < 0:
-                    fx, fy = bx, by
-                    break
                 came, at = 1, (at + 1) % count
                 continue
             fx, fy = ax + along / square * ex, ay + along / square * ey
