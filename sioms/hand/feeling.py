@@ -79,7 +79,9 @@ class Feeling(Motions):
             around.add(touches, one.x, one.y, one.direction)
             if len(touches) == 2:
                 off, at = held_by(touches)
-                fits = off < FITS_RAD * (1.0 + 0.1 * many) and around.spare_m(touches) > SPARE_M
+                spare = around.spare_m(touches) > SPARE_M
+                fits = off < FITS_RAD * (1.0 + 0.1 * many) and spare
+                off += 0.0 if spare else END_RAD
                 if (not fits, off) < best:
                     best, found = (not fits, off), at
                 if fits:
@@ -226,6 +228,8 @@ _MIDDLE_RAD = math.radians(74.0)  # of an array
 FITS_RAD, _NEARLY = math.radians(0.5), (True, math.radians(4.0))
 SPARE_M = 1.5e-3
 """How far from the end of a side a finger that is squeezed feels nothing of it: half the width of a contact at 1 N."""
+END_RAD = math.radians(2.0)
+"""What is parallel by touches nearer to an end is off by, squeezed, a degree or more."""
 _PUSHES_M = 4e-3
 """How far a finger that feels nothing stays behind what is wanted: some 0.06 N on its soft link; free ones 2 mm."""
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed

@@ -14,7 +14,7 @@ import numpy as np
 
 from sioms.hand.around import Around
 from sioms.hand.contacts import FINGER_M, Grasp, classify, grasp_of
-from sioms.hand.feeling import FITS_RAD, SPARE_M, held_by
+from sioms.hand.feeling import END_RAD, FITS_RAD, SPARE_M, held_by
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.regrasp import NEUTRAL, beside
 from sioms.hand.shape import Touch
@@ -95,7 +95,9 @@ def feel_round(subject: Subject, pairs: int, seed: int = 0, regrasps: int = 2) -
             off, at = held_by(touches)
             around.add(touches, x, y, psi)
             psi = at[2]
-            fits = off < FITS_RAD * (1.0 + 0.1 * many) and around.spare_m(touches) > SPARE_M
+            spare = around.spare_m(touches) > SPARE_M
+            fits = off < FITS_RAD * (1.0 + 0.1 * many) and spare
+            off += 0.0 if spare else END_RAD
             if (not fits, off) < best:
                 best, found = (not fits, off), at
             if fits:
