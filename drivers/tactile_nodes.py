@@ -1,4 +1,4 @@
-"""The nodes ``strain`` and ``shape`` that a driver of a tactile finger shows beside its raw readings.
+"""The nodes ``strain``, ``shape`` and ``mean`` that a driver of a tactile finger shows beside its raw readings.
 
 No driver itself: drivers that deliver frames of a finger's elements compose it (decision 0043). Their table
 then has a table ``shape``:
@@ -8,7 +8,10 @@ then has a table ``shape``:
     load_node = "lord1.fz"               # optional: a force sensor under the finger
     load_scale = 50.0                    # N/m for a newton: one over the length of contact in metres
 
-Requests on ``strain`` and ``shape``: ZERO_DEVICE takes a new baseline from the next frames and is answered when it is
+``mean_frames`` in that table adds ``mean``: the shape of the mean of so many frames, one mean after the other, stamped as
+the last of them, by an estimator that knows how much less noise it has: contacts too light for a single frame.
+
+Requests on ``strain``, ``shape`` and ``mean``: ZERO_DEVICE takes a new baseline from the next frames and is answered when it is
 in force, or refused when something touches or the elements fail; CALIBRATE_DEVICE with the text of a finger's file
 loads that finger, without an argument its own again; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
 
@@ -41,7 +44,7 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-STRAIN, SHAPE = "strain", "shape"
+STRAIN, SHAPE, MEAN = "strain", "shape", "mean"
 MOST_FRAMES = 100_000
 """Frames that a baseline may be averaged from."""
 BEHIND_NS = 20_000_000
@@ -60,6 +63,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         settle_frames: frames averaged for the baseline.
         conductor: what touches is a conductor; undoes the proximity effect where the finger's file has it.
         compiled: fit by numba: five times as fast, but seconds to start the first time on a machine.
+        mean_frames: frames of a mean that the node ``mean`` shows the shape of; 0: there is no such node.
     """
 
     finger_file: str
@@ -70,6 +74,7 @@ class ShapeSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     settle_frames: int = 20
     conductor: bool = True
     compiled: bool = False
+    mean_frames: int = 0
 
 
 def inputs(settings: ShapeSettings | None) -> tuple[str, ...]:
@@ -93,16 +98,20 @@ def specs(settings: ShapeSettings | None, elements: int, history: int) -> tuple[
         raise ValueError(f"shape: load_age_s = {settings.load_age_s:g}; want a positive time in seconds")
     if settings.settle_frames < 1:
         raise ValueError(f"shape: settle_frames = {settings.settle_frames}; want 1 or more")
+    if settings.mean_frames and not 2 <= settings.mean_frames <= MOST_FRAMES:
+        raise ValueError(f"shape: mean_frames = {settings.mean_frames}; want 2 to {MOST_FRAMES}, or 0 for no means")
     strains = tuple(ChannelInfo(f"e{i}", "", description="radial strain, tension positive") for i in range(elements))
     shape = tuple(ChannelInfo(name, unit, description=what) for name, unit, what in CHANNELS)
+    means = (BlockSpec(MEAN, NodeClass.ANALOG, shape, history=history),) if settings.mean_frames else ()
     return (
         BlockSpec(STRAIN, NodeClass.ANALOG, strains, history=history),
         BlockSpec(SHAPE, NodeClass.ANALOG, shape, history=history),
+        *means,
     )
 
 
 class TactileNodes:
-    """Fills the two nodes from raw frames.
+    """Fills the nodes from raw frames.
 
     Concurrency: the one thread of the driver process.
 
@@ -110,23 +119,24 @@ class TactileNodes:
         settings: checked by ``specs``.
         blocks: what ``specs`` returned.
         kit: services; reads the load node.
+
+    Attributes:
+        blocks: strain, shape and, where it is wanted, mean.
     """
 
     def __init__(self, settings: ShapeSettings, blocks: Sequence[BlockSpec], kit: Kit) -> None:
         from sioms.tactile.sensing import numbers
 
         self._settings, self._kit, self._numbers = settings, kit, numbers
-        self.strain, self.shape = AnalogBlock(blocks[0]), AnalogBlock(blocks[1])
+        self.blocks = tuple(AnalogBlock(spec) for spec in blocks)
+        self.strain, self.shape, *self._means = self.blocks
         for block in self.blocks:
             block.corrected_by_driver = True
-        self._sensor = self._make(_finger(settings, self.strain.n))
+        for block in self._means:  # until the first one is there
+            block.data[:], block.flags[:] = np.nan, int(AnalogStatus.INVALID)
+        self._take_up(_finger(settings, self.strain.n))
         self._stamp_ns = 0
         self._left_out = 0
-
-    @property
-    def blocks(self) -> tuple[AnalogBlock, ...]:
-        """Strain and shape."""
-        return self.strain, self.shape
 
     def take(
         self, raw: Array, flags: NDArray[np.int64], stamp_ns: int, now_ns: int, begun_ns: int | None = None
@@ -141,8 +151,8 @@ class TactileNodes:
             begun_ns: when the driver began with what came together with this frame; None: it is the only one.
 
         Returns:
-            The blocks to be published: both; strains alone where frames come faster than this machine estimates
-            shapes. The next shape then has the flag OVERRUN.
+            The blocks to be published: strain and shape; strains alone where frames come faster than this machine
+            estimates shapes. The next shape then has the flag OVERRUN. With the last frame of a mean, mean, too.
         """
         readings = np.where(flags & int(AnalogStatus.INVALID), np.nan, raw)
         # a device's clock that began anew may lie a little before the frames already sensed
@@ -162,10 +172,25 @@ class TactileNodes:
         else:
             self.shape.data[:] = self._numbers(self._sensor.estimate(strain, load))
             self.shape.flags[:], self._left_out = self._left_out | saturated, 0
+        if self._means:
+            new = (*new, *self._mean(np.where(strain.saturated, np.nan, readings)))
         for block in new:
             block.flags[np.isnan(block.data)] |= int(AnalogStatus.INVALID)
             block.stamp_ns = stamp_ns
         return new
+
+    def _mean(self, readings: Array) -> tuple[AnalogBlock, ...]:
+        """Add a frame; return the block of the mean with the last of its frames. One frame without an element, or with
+        one that is saturated, is enough for a mean without it.
+        """
+        self._sum += readings
+        self._summed += 1
+        if self._summed < self._settings.mean_frames:
+            return ()
+        frame, self._sum, self._summed = self._sum / self._summed, np.zeros(self.strain.n), 0
+        (block,) = self._means
+        block.data[:], block.flags[:] = self._numbers(self._averaging.frame(frame, self._stamp_ns)), 0
+        return (block,)
 
     def ioctl(self, block: BlockSpec, request: Request, argument: Any) -> Any:
         """Answer the requests named above.
@@ -194,18 +219,21 @@ class TactileNodes:
         frames = 1 if argument is None else argument
         if type(frames) is not int or not 1 <= frames <= MOST_FRAMES:
             raise Refusal(errno.EINVAL, f"{argument!r} frames; want 1 to {MOST_FRAMES}")
-        sensor = self._sensor
+        sensor, now_ns = self._sensor, self._kit.now_ns()
         try:
-            rebase = sensor.rebase(frames, self._kit.now_ns())
+            rebases = [sensor.rebase(frames, now_ns)]
+            if self._means:
+                rebases.append(self._averaging.rebase(math.ceil(frames / self._settings.mean_frames), now_ns))
         except ValueError as error:
             raise Refusal(errno.EBUSY, f"{error}; the baseline stays as it was") from None
 
         def ready() -> tuple[list[float]] | None:
-            if rebase.refused:
-                raise Refusal(errno.EBUSY, f"{rebase.refused}; the baseline stays as it was")
+            for rebase in rebases:
+                if rebase.refused:
+                    raise Refusal(errno.EBUSY, f"{rebase.refused}; the baseline stays as it was")
             if self._sensor is not sensor:
                 raise Refusal(errno.ECANCELED, "another finger has been loaded meanwhile")
-            return ([0.0] * len(block.channels),) if rebase.done else None
+            return ([0.0] * len(block.channels),) if all(rebase.done for rebase in rebases) else None
 
         return Awaited(ready)
 
@@ -218,15 +246,25 @@ class TactileNodes:
 
         finger = from_toml(text)
         _check(finger, self.strain.n, "the finger given")
-        self._sensor = self._make(finger)
+        self._take_up(finger)
         return finger.name
+
+    def _take_up(self, finger: Finger) -> None:
+        self._sensor = self._make(finger, self._settings.settle_frames)
+        self._sum, self._summed = np.zeros(self.strain.n), 0
+        if self._means:
+            many = self._settings.mean_frames
+            quieter = tuple(one / math.sqrt(many) for one in finger.elements.noise)
+            calm = msgspec.structs.replace(finger, elements=msgspec.structs.replace(finger.elements, noise=quieter))
+            self._averaging = self._make(calm, math.ceil(self._settings.settle_frames / many))
 
     def _set_gains(self, argument: Any) -> None:
         n = self.strain.n
         given = np.array(argument, dtype=np.float64).ravel()
         if given.size not in (n, n * n):
             raise ValueError(f"{given.size} gains; want {n}, or {n} rows of {n}")
-        self._sensor.set_gains(given if given.size == n else given.reshape(n, n))
+        for sensor in (self._sensor, *([self._averaging] if self._means else [])):
+            sensor.set_gains(given if given.size == n else given.reshape(n, n))
 
     def _load(self, stamp_ns: int, now_ns: int) -> float | None:
         """Return the load node's reading if it is there, valid and young enough."""
@@ -238,7 +276,7 @@ class TactileNodes:
         except NotMeasuredError:
             return None
 
-    def _make(self, finger: Finger) -> ShapeSensor:
+    def _make(self, finger: Finger, settle_frames: int) -> ShapeSensor:
         from sioms.tactile.cylinder import forget_amplitudes
         from sioms.tactile.sensing import ShapeSensor
 
@@ -248,7 +286,7 @@ class TactileNodes:
             compiled=settings.compiled,
             conductor=settings.conductor,
             tare=_tare(settings),
-            settle_frames=settings.settle_frames,
+            settle_frames=settle_frames,
         )
         sensor.warm()
         forget_amplitudes()

@@ -5,6 +5,7 @@ Nothing waits and nothing is late unless a test says so; what the daemon does (h
 
 from __future__ import annotations
 
+import math
 import tomllib
 from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
@@ -22,10 +23,10 @@ from sioms.drivers.sim.tactile import SimTactile
 from sioms.drivers.sim.world import SimWorld
 from sioms.hand.contacts import FINGER_M, Grasp, grasp_of
 from sioms.hand.control import Gains
-from sioms.hand.felt import felt, internal_force
-from sioms.hand.follow import Follower, Order, standing
+from sioms.hand.felt import felt, internal_force, lightly
+from sioms.hand.follow import D, Follower, Order, standing
 from sioms.hand.kinematics import Hand
-from sioms.hand.touch import Reading, Setpoint
+from sioms.hand.touch import Felt, Reading, Setpoint
 from sioms.motion.commands import WIRE_DTYPE
 from sioms.protocol.flags import AxisStatus, ControlMode
 from sioms.protocol.records import VALUE, read_rows
@@ -101,13 +102,16 @@ class Node:
         return OSError(5, bank.fault_text(int(latched[0])) or "emergency stop") if latched.size else None
 
 
-def write(bank: Any, orders: Sequence[Order], now_ns: int) -> None:
-    """Write velocities and forces to a bank, replacing what it does."""
+def write(bank: Any, orders: Sequence[Order], now_ns: int, most_n: float = math.inf) -> None:
+    """Write velocities and forces to a bank, replacing what it does; with a greatest force of d, if it is finite."""
     records = np.zeros(len(orders), WIRE_DTYPE)
     for record, (axis, presses, value) in zip(records, orders, strict=True):
         record["axis"] = axis
         record["control_mode"] = int(ControlMode.FORCE if presses else ControlMode.VELOCITY)
         record["force" if presses else "velocity"] = value
+        if axis == D and most_n < math.inf:
+            record["control_mode"] |= int(ControlMode.SPECIFIED_MAX_FORCE)
+            record["max_force"] = most_n
     bank.append(records, np.arange(bank.n), now_ns, replace=True)
 
 
@@ -156,10 +160,11 @@ class HandCell:
         self.halted: set[str] = set()
         self.lost: dict[str, str] = {}
         self.hand = Hand()
+        self._yields = "touch" in tables["device"]["hand"]
         self._follower = Follower(Gains())
         self.seen: Callable[[HandCell, Setpoint], None] | None = None
         self._begin_ns, self._was_s = self.now_ns, 0.0
-        self.advance(0.2)
+        self.advance(0.5 if self._yields else 0.2)  # means of frames have to come, too
         self.reading = self._read()
 
     @property
@@ -217,7 +222,8 @@ class HandCell:
         else:
             force = internal_force(*self.reading.fingers) or 0.0
             orders = self._follower.orders(setpoint, self.coordinates, force, max(self._sample_s, 1e-4))
-            write(self.bank, orders, self.now_ns)
+            most = self.drivers["hand"].settings.axis[D].force_max if self._yields else math.inf
+            write(self.bank, orders, self.now_ns, min(setpoint.most_n, most))
         self.advance(2.5e-3)
         self.reading = self._read()
         if self.seen is not None:
@@ -238,7 +244,13 @@ class HandCell:
             feels.append(felt(row["value"].tolist(), 20e-3))
             ages.append((self.now_ns - self.nodes[name].stamp_ns) * 1e-9)
         joints: Any = self.hand.inverse(self.coordinates)
-        return Reading(time_s, joints, (feels[0], feels[1]), (ages[0], ages[1]))
+        light = self._lightly() if self._yields else None
+        return Reading(time_s, joints, (feels[0], feels[1]), (ages[0], ages[1]), light=light)
+
+    def _lightly(self) -> tuple[Felt, Felt]:
+        touch = self.nodes["hand.touch"].read(self.now_ns)["value"].tolist()
+        one, two = (felt(self.nodes[f"touch{i}.mean"].read(self.now_ns)["value"].tolist(), 20e-3) for i in (1, 2))
+        return lightly(touch[0], touch[2], one), lightly(touch[1], touch[3], two)
 
     def truth(self) -> Grasp:
         """Return the true grasp."""

@@ -136,6 +136,11 @@ class Compound(TickDriver):
         return bool(axis.force_node)
 
     @classmethod
+    def yields(cls, settings: Any, axis: Any) -> bool:
+        """Return whether a command of a coordinate may say a greatest force: the kind sees to what that does."""
+        return False
+
+    @classmethod
     def describe(cls, name: str, settings: Any) -> Description:
         """Tell the coordinates, and what is held and read."""
         cls.transform(settings)
@@ -154,7 +159,7 @@ class Compound(TickDriver):
         for given in _settings(cls, settings):
             assert given.modes
         channels = tuple(
-            _channel(cls.COORDINATES[axis.name], axis, cls.presses(settings, axis)) for axis in settings.axis
+            _channel(cls.COORDINATES[axis.name], axis, _modes(cls, settings, axis)) for axis in settings.axis
         )
         block = BlockSpec("", NodeClass.AXIS, channels, history=settings.history, capacity=settings.capacity)
         felt = tuple(dict.fromkeys(axis.force_node for axis in settings.axis if axis.force_node))
@@ -456,8 +461,10 @@ class Compound(TickDriver):
         return [float(p - o) for p, o in zip(shown, self.bank.arrays["offset"], strict=True)]
 
 
-def _modes(presses: bool) -> ControlMode:
-    return MODES | ControlMode.FORCE if presses else MODES
+def _modes(kind: type[Compound], settings: Any, axis: Any) -> ControlMode:
+    force = ControlMode.FORCE if kind.presses(settings, axis) else ControlMode(0)
+    most = ControlMode.SPECIFIED_MAX_FORCE if kind.yields(settings, axis) else ControlMode(0)
+    return MODES | force | most
 
 
 def _k(axis: Any) -> float:
@@ -477,7 +484,7 @@ def _settings(kind: type[Compound], settings: Any) -> list[AxisSettings]:
             {
                 "kind": AxisKind.SERVO,
                 "unit": kind.COORDINATES[axis.name],
-                "modes": _modes(kind.presses(settings, axis)),
+                "modes": _modes(kind, settings, axis),
                 "k": _k(axis),
             },
         )
@@ -485,12 +492,12 @@ def _settings(kind: type[Compound], settings: Any) -> list[AxisSettings]:
     ]
 
 
-def _channel(unit: str, axis: Any, presses: bool) -> ChannelInfo:
+def _channel(unit: str, axis: Any, modes: ControlMode) -> ChannelInfo:
     limits = {"velocity": axis.velocity_max, "acceleration": axis.acceleration_max}
     if axis.jerk_max is not None:
         limits["jerk"] = axis.jerk_max
-    if presses:
+    if modes & (ControlMode.FORCE | ControlMode.SPECIFIED_MAX_FORCE):
         limits["force"] = axis.force_max
     return ChannelInfo(
-        axis.name, unit, axis.position_min, axis.position_max, 0, int(_modes(presses)), limits, axis.description
+        axis.name, unit, axis.position_min, axis.position_max, 0, int(modes), limits, axis.description
     )  # fmt: skip

@@ -2,7 +2,9 @@
 
 A device made of devices, see drivers/compound/README.md. With a table ``squeeze`` d takes force commands: an internal
 force [N], positive squeezes. In free space d then yields as a virtual spring about where it was, in contact it follows
-the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. The node
+the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. With a table
+``touch`` commands of d may say a greatest force: as long as it holds, each finger yields by itself (sioms.hand.yielding),
+and the node ``touch`` shows what each feels. The node
 ``force`` shows that force and how late all this is, the node ``model`` what the hand is known to be: what is stated, or
 what ``model_file`` says, which ``sioms reconcile hand`` writes. hand.toml is an example without a sense of
 touch, etc/hand.toml a whole hand with fingers that feel.
@@ -26,6 +28,7 @@ from sioms.hand.felt import felt, internal_force, wrist_force
 from sioms.hand.kinematics import COORDINATES, LINK_M, LONGEST_M, UNITS, Hand
 from sioms.hand.model import HandModel, model_of
 from sioms.hand.statics import damped_limit, filtered_limit
+from sioms.hand.yielding import yielded
 from sioms.motion.axis_step import FORCE
 from sioms.protocol.flags import AnalogStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo
@@ -34,8 +37,10 @@ from sioms.sdk.driver import Kit
 from sioms.sdk.inputs import NotMeasuredError
 from sioms.tactile.sensing import CHANNELS
 
+from . import touching
 from .compound import Compound, CompoundSettings
 from .readings import Reading
+from .touching import Touching, TouchTable
 
 D, PSI = COORDINATES.index("d"), COORDINATES.index("psi")
 _TH = (2, 5)
@@ -110,6 +115,7 @@ class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw
         least_m: the least d that has a direction; how far the hand may close says the d of the coordinates.
         link_stiffness: of each link and its finger behind the encoder of its axis [N m/rad]; infinite: none gives.
         squeeze: how it squeezes; without it d takes no force commands.
+        touch: how fingers yield, each by itself; without it commands of d say no greatest force.
         pace: of a simulated hand in slow motion, see sioms.hand.slow: what takes 1 s there takes 1/pace s here.
     """
 
@@ -119,6 +125,7 @@ class HandSettings(CompoundSettings, frozen=True, forbid_unknown_fields=True, kw
     least_m: float = 1e-3
     link_stiffness: float = math.inf
     squeeze: SqueezeTable | None = None
+    touch: TouchTable | None = None
     pace: float = 1.0
     tick_hz: float = 400.0
 
@@ -143,8 +150,13 @@ class HandDriver(Compound):
         return axis.name == "d" and settings.squeeze is not None
 
     @classmethod
+    def yields(cls, settings: HandSettings, axis: Any) -> bool:
+        """Return whether a command may say a greatest force: of d, which holds for both fingers."""
+        return axis.name == "d" and settings.touch is not None
+
+    @classmethod
     def describe(cls, name: str, settings: HandSettings) -> Description:
-        """Tell the coordinates and the force."""
+        """Tell the coordinates and the forces."""
         base = super().describe(name, settings)
         for key, (least, most) in _BOUNDS.items():
             if not least <= getattr(settings, key) <= most:
@@ -152,20 +164,26 @@ class HandDriver(Compound):
         if any(axis.force_node for axis in settings.axis):
             raise ValueError("axis: has a force_node; want the table squeeze, which says from where the force comes")
         model = _spec("model", _model_channels(settings), settings.history)
-        squeeze = settings.squeeze
-        if squeeze is None:
-            return Description((*base.blocks, model), base.tick_hz, base.inputs, holds=base.holds)
-        _check(squeeze, settings)
-        force = _spec("force", _CHANNELS, settings.history)
-        return Description((*base.blocks, force, model), base.tick_hz, _nodes(squeeze), holds=base.holds)
+        blocks, nodes = list(base.blocks), list(base.inputs)
+        if settings.squeeze is not None:
+            _check(settings.squeeze, settings)
+            blocks.append(_spec("force", _CHANNELS, settings.history))
+            nodes += _nodes(settings.squeeze)
+        if settings.touch is not None:
+            touching.check(settings.touch)
+            blocks.append(_spec("touch", touching.SHOWN, settings.history))
+            nodes += settings.touch.nodes
+        return Description((*blocks, model), base.tick_hz, tuple(dict.fromkeys(nodes)), holds=base.holds)
 
     def __init__(self, name: str, settings: HandSettings, kit: Kit) -> None:
         super().__init__(name, settings, kit)
         squeeze, self._model = settings.squeeze, known(settings)
         self._controller = Controller(_gains(squeeze, settings)) if squeeze is not None else None
-        *shown, model = self.describe(name, settings).blocks[1:]
-        self._shown_force = AnalogBlock(shown[0]) if shown else None
-        self._shown_model = AnalogBlock(model)
+        shown = {spec.name: AnalogBlock(spec) for spec in self.describe(name, settings).blocks[1:]}
+        self._shown_force, self._shown_touch = shown.get("force"), shown.get("touch")
+        self._shown_model = shown["model"]
+        touch = settings.touch
+        self._touching = Touching(touch, kit.inputs, self._model, settings.pace) if touch is not None else None
         self._shown_model.data[:] = numbers(self._model)
         self._force: float | None = None
         self._why = "not read yet"
@@ -178,18 +196,23 @@ class HandDriver(Compound):
 
     @property
     def blocks(self) -> Sequence[AnyBlock]:
-        """The coordinates, the force, and what the hand is known to be."""
-        force = () if self._shown_force is None else (self._shown_force,)
-        return (self._block, *force, self._shown_model)
+        """The coordinates, the forces, and what the hand is known to be."""
+        forces = [block for block in (self._shown_force, self._shown_touch) if block is not None]
+        return (self._block, *forces, self._shown_model)
 
     def tick(self, now_ns: int) -> None:
         """Take the force, then as any device made of devices."""
         seen_ns = self._newest_ns
         if self._controller is not None:
             self._feel(self._controller, now_ns)
+        if self._touching is not None:
+            self._touching.take(now_ns, self._turns())
         super().tick(now_ns)
         if self._shown_force is not None:
             self._show(self._shown_force, now_ns, self._newest_ns != seen_ns)
+        if self._shown_touch is not None and self._touching is not None:
+            self._shown_touch.data[:] = self._touching.shown()
+            self._shown_touch.flags[:] = _INVALID if self._touching.why else 0
 
     def bent(self, taken: Reading) -> list[float]:
         """Return the joints with the links turned by what their drives' torques bend them."""
@@ -215,6 +238,30 @@ class HandDriver(Compound):
         return self._controller.opening(self._about, 0.0, d, wanted, self._touches)
 
     def _wanted(self, now_ns: int) -> list[float]:
+        """Return the velocities of the coordinates; under a greatest force no finger presses harder than that.
+
+        What holds a finger back is an error that would be brought back ever harder: none is, meanwhile.
+        """
+        touch, table = self._touching, self.settings.touch
+        most_n = float(self.bank.arrays["force_limit"][D])
+        if touch is None or not most_n < self.settings.axis[D].force_max:
+            return self._squeezed(now_ns)
+        if touch.why:
+            self.bank.fault(self._all, f"axis d: no force is known: {touch.why}", now_ns)
+            return [0.0] * self.bank.n
+        if touch.touched(now_ns):
+            self._errors = [0.0] * self.bank.n
+        fastest = float(self.bank.arrays["velocity_limit"][D])
+        return list(yielded(self._squeezed(now_ns), self._at, touch.pushes, most_n, table.damper, fastest))
+
+    def _turns(self) -> tuple[float, float]:
+        """Return the angles of both links, as of the last tick."""
+        if not self._at:
+            return 0.0, 0.0
+        _, _, psi, _, phi1, phi2 = self._at
+        return psi - phi1, psi - phi2 + math.pi
+
+    def _squeezed(self, now_ns: int) -> list[float]:
         """Return the velocities of the coordinates; in contact the links alone squeeze."""
         wanted = super()._wanted(now_ns)
         controller = self._controller

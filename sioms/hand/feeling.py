@@ -36,6 +36,7 @@ class Feeling(Motions):
             known: touches of the grasp before, made where the hand is; none: it begins there.
         """
         before, self.state = self.state, State.FEEL
+        before_n, self._most_n = self._most_n, self.manner.yield_n
         x, y, direction, d, *_ = self._goal
         around, begun = self._around or Around(), self.taps
         first = None if known else Parallel(x, y, direction, d - 2.0 * FINGER_M, math.inf)
@@ -88,7 +89,7 @@ class Feeling(Motions):
                     break
         self._around = around
         self.say(f"felt {self.taps - begun} places round it: {'a' if found else 'no'} parallel grasp")
-        self.state = before
+        self.state, self._most_n = before, before_n
         return None if found is None else (*found, self._goal[3], NEUTRAL, NEUTRAL)
 
     @property
@@ -117,7 +118,7 @@ class Feeling(Motions):
         touch: Touch | None = None
         pushed: tuple[float, float] | None = None
         while way < most and pushed is None:
-            finger, before_s = self.now.fingers[index], self.now.time_s
+            finger, before_s = self._feels(index), self.now.time_s
             if before_s > latest_s:
                 raise Failed(
                     Fault.DOUBTFUL,
@@ -134,7 +135,7 @@ class Feeling(Motions):
                 along = self._by_link(index, rate)
             yield from self._follow(along, 0.0)
             gone_s = self.now.time_s - before_s
-            told = self.now.fingers[index]
+            told = self._feels(index)
             unfelt_s = 0.0 if told.touched else unfelt_s + gone_s
             beside_s = max(beside_s + gone_s * (1 if _BESIDE in told.doubt else -1 if told.touched else 0), 0.0)
             if beside_s > _BESIDE_S:  # pressed on, it would push the object away
@@ -143,7 +144,7 @@ class Feeling(Motions):
             at = self._centre(index, self.now.joints)
             if not met and math.dist(at, self._centre(index, self.hand.inverse(self._goal))) > _PUSHES_M:
                 pushed = at
-            force += min(gone_s / _FILTER_S, 1.0) * (self.now.fingers[index].force - force)
+            force += min(gone_s / _FILTER_S, 1.0) * (told.force - force)
             rested_s = rested_s + gone_s if rate == 0.0 else 0.0
             if rested_s > _RESTED_S:
                 touch, presses_on = yield from self._felt_by(index)
@@ -194,11 +195,11 @@ class Feeling(Motions):
         points: list[tuple[float, float]] = []
         normals: list[float] = []
         doubts: list[str] = []
-        frames = _FRAMES * self.manner.frames
+        frames = self.manner.tap_frames
         for _ in range(frames):
             self._yield()
             yield from self._follow((0.0,) * 6, 0.0)
-            finger = self.now.fingers[index]
+            finger = self._feels(index)
             if not finger.touched or not math.isfinite(finger.phi):
                 continue
             if misleading := _MISLEADS.intersection(finger.doubt.split("|")):
@@ -217,7 +218,7 @@ class Feeling(Motions):
                 f"{self._what}: finger {index + 1} says {doubts[-1]!r} in {len(doubts)} of {frames} frames of a touch "
                 "of its own; want a contact that its array covers",
             )
-        if count < self.manner.frames // 2:
+        if count < frames // 4:
             return None, True
         normal = normals[0] + sum(math.remainder(one - normals[0], math.tau) for one in normals) / count
         place = sum(x for x, _ in points) / count, sum(y for _, y in points) / count
@@ -233,7 +234,6 @@ END_RAD = math.radians(2.0)
 _PUSHES_M = 4e-3
 """How far a finger that feels nothing stays behind what is wanted: some 0.06 N on its soft link; free ones 2 mm."""
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
-_FRAMES = 2  # times those of a grasp, for lighter touches
 _CREEP = 0.3  # of the closing speed, once it has met it
 _FILTER_S, _RESTED_S, _UNFELT_S = 0.03, 0.1, 0.5
 _BESIDE, _BESIDE_S = "OUT_OF_ARC", 0.02

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 from sioms.hand.touch import Felt
 from sioms.tactile.quality import Quality, State, state_of
@@ -50,6 +51,22 @@ def felt(shape: Sequence[float], length_m: float) -> Felt:
         True, angle, math.sqrt(max(shape[_VAR_ANGLE], 0.0)), load * length_m, shape[_RADIUS],
         math.sqrt(max(shape[_VAR_RADIUS], 0.0)), doubt,
     )  # fmt: skip
+
+
+def lightly(touched: float, force: float, mean: Felt) -> Felt:
+    """Return what a finger feels of a touch too light for a single frame of its own.
+
+    Args:
+        touched: 1 while something touches, 0 while nothing, nan while that is not known; with `force` [N] as the node
+            ``touch`` of a hand shows it.
+        force: with which it presses.
+        mean: what the mean of many frames feels; the place is its own.
+    """
+    if touched not in (0.0, 1.0) or not math.isfinite(force) or mean.touched is None:
+        return Felt(None)
+    if not touched:
+        return _NO_FLAGS
+    return replace(mean, force=force) if mean.touched else Felt(True, force=force)
 
 
 def internal_force(one: Felt, two: Felt) -> float | None:

@@ -11,7 +11,7 @@ from collections.abc import Generator, Sequence
 from sioms.hand.contacts import FINGER_M, Grasp, grasp
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.regrasp import NEUTRAL
-from sioms.hand.touch import Event, Failed, Fault, Manner, Reading, Setpoint, State
+from sioms.hand.touch import Event, Failed, Fault, Felt, Manner, Reading, Setpoint, State
 
 Ticks = Generator[Setpoint, Reading, None]
 STILL: Six = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -40,6 +40,7 @@ class Motions:
         self._held, self._what = False, ""
         self._missing = [0.0, 0.0]
         self._warned = False
+        self._most_n = math.inf  # of each finger by itself
 
     def say(self, text: str, fault: Fault | None = None) -> None:
         """Add an event."""
@@ -49,6 +50,10 @@ class Motions:
         """Return the internal force that both fingers tell [N]: 0 unless both are touched."""
         one, two = self.now.fingers
         return 0.5 * (one.force + two.force) if one.touched and two.touched else 0.0
+
+    def _feels(self, index: int) -> Felt:
+        """Return what a finger feels of the lightest touch."""
+        return (self.now.light or self.now.fingers)[index]
 
     @property
     def holds(self) -> bool:
@@ -74,6 +79,7 @@ class Motions:
                 )
             one, two = (gone_s < _MET_S for gone_s in since)
             before_s, both = self.now.time_s, one and two
+            self._most_n = math.inf if both else manner.yield_n  # the first one waits, and pushes nothing away
             drift = 0.0 if one == two else (-0.5 if one else 0.5) * speed
             pressed = all(finger.touched for finger in self.now.fingers)
             shut = 0.0 if pressed else -_CREEP * speed if both else -speed
@@ -84,7 +90,7 @@ class Motions:
             self._goal[3] = apart if both else max(self._goal[3], apart - _AHEAD_M)
             pressed_s = (pressed_s + gone_s * pressed) if both else 0.0
             since = [
-                0.0 if finger.touched else past + gone_s for finger, past in zip(self.now.fingers, since, strict=True)
+                0.0 if self._feels(i).touched else past + gone_s for i, past in enumerate(since)
             ]
             if self._goal[3] < manner.opening[0] and not both:
                 raise Failed(
@@ -164,7 +170,7 @@ class Motions:
         last_s = self.now.time_s
         goal: Six = tuple(self._goal)  # type: ignore[assignment]
         rates: Six = tuple(along)  # type: ignore[assignment]
-        self.now = yield Setpoint(goal, rates, force)
+        self.now = yield Setpoint(goal, rates, force, most_n=self._most_n)
         gone_s = self.now.time_s - last_s
         if not gone_s > 0.0:  # every wait would last for ever
             raise Failed(
@@ -192,6 +198,11 @@ class Motions:
         except ValueError as error:
             raise Failed(Fault.SINGULAR, f"{what}: {error}") from None
         for i, (finger, age_s) in enumerate(zip(self.now.fingers, self.now.ages_s, strict=True)):
+            if self._most_n < math.inf and self._feels(i).touched is None:
+                raise Failed(
+                    Fault.STALE,
+                    f"{what}: nothing tells what finger {i + 1} touches; want its force sensor, which yielding needs",
+                )
             unknown = not math.isfinite(finger.force)
             if not age_s <= manner.stale_s or finger.touched is None or unknown:
                 why = "its force is not known" if unknown else "it is blind"

@@ -24,6 +24,7 @@ from sioms.hand.kinematics import LINK_M, Hand, Six
 from sioms.hand.regrasp import NEUTRAL
 from sioms.hand.running import carried_out
 from sioms.hand.touch import Felt, Reading, Setpoint
+from sioms.hand.yielding import Push, yielded
 from sioms.plant.finger import FingerShape, TactileArray
 from sioms.plant.planar import Body, Mount, World
 from sioms.tactile.cylinder import Cylinder
@@ -34,6 +35,7 @@ from sioms.tactile.quality import Quality, State
 T = TypeVar("T")
 SHAPE = FingerShape()
 _FREE_STEPS = 2
+_YIELDING, _RETREATS = 0.2, 0.1  # damper of a finger that yields [m/(s N)], and how fast it retreats [m/s]
 RUBBER_M = SHAPE.radius_m - SHAPE.core_m
 
 
@@ -151,6 +153,12 @@ class PlaneHand:
             force = 0.5 * (one.force + two.force) if one.touched and two.touched else 0.0
             now = self.hand.forward(self.reading.joints)
             rates = self.controller.rates(setpoint.goal, setpoint.along, now, setpoint.force, force, tick_s)
+            if setpoint.most_n < math.inf:
+                pushes = [
+                    Push(finger.force, self.reading.joints[3 * i + 2] + finger.phi) if finger.touched else None
+                    for i, finger in enumerate(self._felt)
+                ]
+                rates = yielded(rates, now, pushes, setpoint.most_n, _YIELDING, _RETREATS)
             turn = self.hand.joint_rates(now, rates)
             self.joints = [joint + tick_s * rate for joint, rate in zip(self.joints, turn, strict=True)]
         world.command([self.joints[:3], self.joints[3:]], tick_s)

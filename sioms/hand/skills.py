@@ -100,7 +100,7 @@ class Skills(Feeling):
     # the state machine
 
     def _guarded(self, what: str, ticks: Generator[Setpoint, Reading, T]) -> Generator[Setpoint, Reading, T]:
-        self._what, self.state = f"{what} object", State.IDLE
+        self._what, self.state, self._most_n = f"{what} object", State.IDLE, math.inf
         try:
             return (yield from ticks)
         except Failed as failed:

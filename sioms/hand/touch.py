@@ -47,6 +47,8 @@ class Reading:
         fingers: what each feels.
         ages_s: of the two frames from which that comes, at this tick.
         calibrated: whether each finger has a calibration.
+        light: what each finger feels of the lightest touches, where that is told by something else: wrists, means of
+            frames.
     """
 
     time_s: float
@@ -54,6 +56,7 @@ class Reading:
     fingers: tuple[Felt, Felt]
     ages_s: tuple[float, float] = (0.0, 0.0)
     calibrated: tuple[bool, bool] = (True, True)
+    light: tuple[Felt, Felt] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,12 +68,14 @@ class Setpoint:
         along: the rates at which the goal moves [m/s, rad/s].
         force: internal force [N]; below 0 lets go.
         frozen: the joints stay where they are, whatever the rest says.
+        most_n: greatest force of each finger by itself [N]: beyond it the finger yields. Infinite: none does.
     """
 
     goal: Six
     along: Six
     force: float
     frozen: bool = False
+    most_n: float = math.inf
 
 
 _MANNERS = {
@@ -79,7 +84,7 @@ _MANNERS = {
     "roll_s": (1e-3, 1e5), "clearance_m": (1e-4, 0.1), "tolerance_rad": (1e-6, 1.0), "held_rad": (0.0, 1.0),
     "frames": (1, 100_000), "light_rad": (0.0, math.pi), "squeeze_rad": (0.0, math.pi), "friction": (1e-3, 100.0),
     "most_n": (1e-3, 1e3), "lost_s": (1e-3, 100.0), "stale_s": (1e-3, 100.0), "regrasps": (0, 1000),
-    "tap_n": (1e-3, 1e3), "taps": (0, 1000),
+    "tap_n": (1e-3, 1e3), "taps": (0, 1000), "tap_frames": (1, 100_000), "yield_n": (1e-3, 1e3),
 }  # fmt: skip
 """Bounds of how a skill may be done."""
 
@@ -180,6 +185,8 @@ class Manner:
         regrasps: at most so many.
         tap_n: with which one finger touches what lies on the platen [N]; less than moves it.
         taps: pairs of such touches before a regrasp, at most; 0 for none.
+        tap_frames: averaged where such a touch is sensed.
+        yield_n: force beyond which a finger yields that touches alone [N].
         smallest: roll towards the smallest diameter, as the source does; else towards the nearest parallel grasp.
         opening: least and largest d [m].
         reach: of the carriages, x and y from and to [m].
@@ -208,6 +215,8 @@ class Manner:
     regrasps: int = 4
     tap_n: float = 0.04
     taps: int = 14
+    tap_frames: int = 80
+    yield_n: float = 0.08
     smallest: bool = False
     opening: tuple[float, float] = (2.0 * FINGER_M + 5e-3, 0.2)
     reach: tuple[float, float, float, float] = (-0.4, 0.4, -0.6, 0.6)

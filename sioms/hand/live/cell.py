@@ -23,8 +23,8 @@ from sioms.client.node import AxisNode
 from sioms.client.stream import Stream
 from sioms.client.workcell import Workcell
 from sioms.hand.control import Gains
-from sioms.hand.felt import felt, internal_force, no_shape
-from sioms.hand.follow import Follower, Order, standing
+from sioms.hand.felt import felt, internal_force, lightly, no_shape
+from sioms.hand.follow import D, Follower, Order, standing
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.model import HandModel
 from sioms.hand.running import carried_out
@@ -33,19 +33,21 @@ from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import AXIS_WRITE, WRITE
 
 T = TypeVar("T")
-FINGERS = ("touch1.shape", "touch2.shape")
+FINGERS, MEANS = ("touch1.shape", "touch2.shape"), ("touch1.mean", "touch2.mean")
 LEASE_S = 0.25
 _NAMES = list(WRITE[NodeClass.AXIS])
-_MODE, _VELOCITY, _FORCE = (_NAMES.index(name) for name in ("control_mode", "velocity", "force"))
+_MODE, _VELOCITY, _FORCE, _MAX_FORCE = map(_NAMES.index, ("control_mode", "velocity", "force", "max_force"))
 _JOG = int(ControlMode.VELOCITY)
 _PRESS = int(ControlMode.FORCE)
+_MOST = int(ControlMode.SPECIFIED_MAX_FORCE)
 _NEW_S = 1.0
 _FIRST_S = 10.0
 _WATCHED = 40
 _ENOUGH = 0.5
-MANNER = Manner(light_n=0.4, taps=0)
-"""Light touches are a little firmer than on the plane, and no object is felt round: a live finger tells a contact from
-0.14 N on, and the platen holds an object against one finger with 0.2 N."""
+MANNER = Manner(light_n=0.4, tap_n=0.06, tap_frames=480)
+"""Light touches are a little firmer than on the plane, and felt for longer: a frame of a live finger tells a contact from
+0.14 N on, a mean of 40 from 0.02 N on, and the platen holds an object against one finger with 0.1 to 0.2 N."""
+_TOUCH = ("touched1", "touched2", "force1", "force2")
 _BLIND = Felt(None)
 
 
@@ -56,6 +58,8 @@ class CellHand:
         cell: the session.
         name: of the hand's node.
         fingers: nodes of what each finger feels.
+        means: nodes of what means of their frames feel; objects are felt round where they and the hand's node ``touch``
+            are there.
         gains: of the laws, in the hand's time; the damper's are the driver's own.
         length_m: of the contact along a finger.
         lease_s: of the hand's node, in the hand's time.
@@ -77,7 +81,7 @@ class CellHand:
 
     def __init__(
         self, cell: Workcell, name: str = "hand", fingers: Sequence[str] = FINGERS, *,
-        gains: Gains = Gains(), length_m: float = 20e-3, lease_s: float = LEASE_S,  # noqa: B008
+        means: Sequence[str] = MEANS, gains: Gains = Gains(), length_m: float = 20e-3, lease_s: float = LEASE_S,  # noqa: B008
     ) -> None:  # fmt: skip
         self._length_m = length_m
         self.pace = _watched(cell, f"{name}.force", fingers)
@@ -90,7 +94,15 @@ class CellHand:
             limits = [channel.limits.get("velocity", math.inf) for channel in self._node.info.channels]
             self._follower = Follower(gains, [0.999 * limit / self.pace for limit in limits])
             self._fingers: list[Any] = [stack.enter_context(cell.open(f"{node}")) for node in fingers]
-            for node in self._fingers:
+            there = {one.name for one in cell.nodes()}
+            self._light: list[Any] = []
+            if {touch := f"{name}.touch", *means} <= there:
+                self._light = [stack.enter_context(cell.open(node)) for node in (touch, *means)]
+            else:  # a finger that is not told to yield pushes the object away
+                self.manner = replace(self.manner, taps=0)
+            most = self._node.info.channels[D].limits.get("force", math.inf)
+            self._most_n = most if self._light else math.inf
+            for node in (*self._fingers, *self._light[1:]):
                 if why := no_shape(node.name, [channel.name for channel in node.info.channels]):
                     raise OSError(errno.EINVAL, f"take the hand: {why}")
             self._stream = Stream(self._node, ahead=8)
@@ -132,7 +144,7 @@ class CellHand:
         if setpoint.frozen:
             self.stop()
         else:
-            self._write(self._follower.orders(setpoint, self._at, self.force, self._sample_s))
+            self._write(self._follower.orders(setpoint, self._at, self.force, self._sample_s), setpoint.most_n)
         self.reading = self._read()
         if self.seen is not None:
             self.seen(self.reading, setpoint)
@@ -158,8 +170,10 @@ class CellHand:
         """The internal force that both fingers tell [N], 0 while it is not known."""
         return internal_force(*self.reading.fingers) or 0.0
 
-    def _write(self, orders: Sequence[Order]) -> None:
-        self._stream.write(b"".join([_record(*order, self.pace) for order in orders]), replace=True)
+    def _write(self, orders: Sequence[Order], most_n: float = math.inf) -> None:
+        most = [min(most_n, self._most_n) if axis == D else math.inf for axis, *_ in orders]
+        records = [_record(*order, self.pace, one) for order, one in zip(orders, most, strict=True)]
+        self._stream.write(b"".join(records), replace=True)
 
     def _read(self) -> Reading:
         """Wait for the next publication of the hand; read what the fingers feel by then."""
@@ -181,7 +195,19 @@ class CellHand:
             self.told[i] = felt(frame.data, self._length_m)
         ages = [max((now_ns - stamp_ns) * pace_s, 0.0) for stamp_ns in self._stamps_ns]
         one, two = (self.model.corrected(felt, i) for i, felt in enumerate(self.told))
-        return Reading(time_s, self.hand.inverse(self._at), (one, two), (ages[0], ages[1]))
+        return Reading(
+            time_s, self.hand.inverse(self._at), (one, two), (ages[0], ages[1]), light=self._lightly() if self._light else None
+        )
+
+    def _lightly(self) -> tuple[Felt, Felt]:
+        """Return what each finger feels of the lightest touch; not known where a node cannot be read."""
+        try:
+            touch, *means = (node.read() for node in self._light)
+            told = [touch.measured(name) for name in _TOUCH]
+        except OSError:
+            return _BLIND, _BLIND
+        feels = [self.model.corrected(felt(mean.data, self._length_m), i) for i, mean in enumerate(means)]
+        return lightly(told[0], told[2], feels[0]), lightly(told[1], told[3], feels[1])
 
 
 def _known(cell: Workcell, name: str) -> HandModel:
@@ -217,9 +243,12 @@ def _watched(cell: Workcell, force: str, fingers: Sequence[str]) -> float:
         return float(shown[0].measured("pace"))
 
 
-def _record(axis: int, presses: bool, value: float, pace: float) -> bytes:
-    """Return a command of a force [N], or of a velocity in the hand's time."""
+def _record(axis: int, presses: bool, value: float, pace: float, most_n: float) -> bytes:
+    """Return a command of a force [N], or of a velocity in the hand's time; with a greatest force [N], if it is finite."""
     fields: list[Any] = [0] * len(_NAMES)
     fields[0], fields[_MODE] = axis, _PRESS if presses else _JOG
+    if most_n < math.inf:
+        fields[_MODE] |= _MOST
+        fields[_MAX_FORCE] = most_n
     fields[_FORCE if presses else _VELOCITY] = value if presses else value * pace
     return AXIS_WRITE.pack(*fields)
