@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -160,6 +161,18 @@ def met(corners: Array, radius_m: float, origin: Array, angle: float) -> float |
     return found
 
 
+class Spare(NamedTuple):
+    """How far a touch is from the end of the side that it is on.
+
+    Args:
+        room_m: infinite for a touch on no side.
+        way: along the side [m, m], of length 1, where it is not known farther than that; None where it ends.
+    """
+
+    room_m: float
+    way: tuple[float, float] | None
+
+
 class Around:
     """What touches all round an object let expect.
 
@@ -205,19 +218,32 @@ class Around:
         self.tried(x, y, psi)
         self.smooth = self._wrong[1] < self._wrong[0]
 
-    def spare_m(self, touches: Sequence[Touch]) -> float:
-        """Return how far added touches lie from the nearest end of a side that they are on [m]; infinite off sides."""
+    def spare(self, touches: Sequence[Touch]) -> Spare:
+        """Return how far added touches lie from the nearest end of a side that they are on.
+
+        Where nobody has met what ends a side, it is known no farther than it was touched.
+        """
+        found = Spare(math.inf, None)
         if self.smooth:
-            return math.inf
-        sides, least = sides_through(self._touches), math.inf
+            return found
+        sides, count = sides_through(self._touches), len(self._touches)
         for number, touch in enumerate(self._touches):
             for first, owners in enumerate(sides.owners):
-                along = sides.corners[(first + 1) % len(sides.corners)] - sides.corners[first]
+                last = (first + 1) % len(sides.corners)
+                along = sides.corners[last] - sides.corners[first]
                 length = math.hypot(*along)
-                if number in owners and length > _END_M and any(touch is one for one in touches):
-                    at = float((sides.points[number] - sides.corners[first]) @ along) / length
-                    least = min(least, max(min(at, length - at), 0.0))
-        return least
+                if number not in owners or length <= _END_M or all(touch is not one for one in touches):
+                    continue
+                way = along / length
+                at = [float((sides.points[i] - sides.corners[first]) @ way) for i in range(count)]
+                for sign, end, beyond in ((-1.0, at[number], sides.owners[first - 1]), (
+                    1.0, length - at[number], sides.owners[last]
+                )):  # fmt: skip
+                    felt = max(sign * (at[i] - at[number]) for i in owners)
+                    room = max(end, 0.0) if beyond else felt
+                    if room < found.room_m:
+                        found = Spare(room, None if beyond else (sign * float(way[0]), sign * float(way[1])))
+        return found
 
     def _sides_outline(self) -> tuple[Array, float]:
         sides = sides_through(self._touches)

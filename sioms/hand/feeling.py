@@ -10,10 +10,11 @@ import math
 from collections.abc import Generator, Sequence
 
 from sioms.hand.around import Around
-from sioms.hand.contacts import FINGER_M, grasp_of
+from sioms.hand.contacts import FINGER_M
 from sioms.hand.kinematics import Six
 from sioms.hand.motions import LETTING_GO_N, Motions
 from sioms.hand.regrasp import NEUTRAL
+from sioms.hand.seeking import Seeking
 from sioms.hand.shape import Parallel, Touch
 from sioms.hand.touch import Failed, Fault, Reading, Setpoint, State
 from sioms.tactile.quality import DOUBT, Quality
@@ -46,9 +47,9 @@ class Feeling(Motions):
             around.add(known, x, y, direction)
         opened = max(self._goal[3], self._free_m)
         yield from self._move((x, y, direction, opened, *self._goal[4:]))
-        best, found = _NEARLY, None
-        for many in range(self.manner.taps):
-            one, first = first or around.next(direction, self._least_m), None
+        seeking = Seeking(around)
+        for _ in range(self.manner.taps):
+            one, first = first or seeking.next(direction, self._least_m), None
             if one is None:
                 break
             if one.apart_m < self._least_m:
@@ -61,7 +62,7 @@ class Feeling(Motions):
             if not self._reaches(target):
                 break
             if (yield from self._move(target)):  # it was in the way, and may lie elsewhere now
-                around, best, found = Around(), _NEARLY, None
+                seeking = Seeking(around := Around())
                 opened = min(opened + 2.0 * self.manner.clearance_m, self.manner.opening[1] - 1e-3)
             touches: list[Touch] = []
             pushed = None
@@ -72,21 +73,16 @@ class Feeling(Motions):
                     break
             if pushed is not None:  # it is beside that finger, and may lie otherwise now
                 self.say(f"finger {index + 1} pushes what its array does not feel, at {_place(pushed)}: felt anew")
-                around, best, found = Around(), _NEARLY, None
+                seeking = Seeking(around := Around())
                 first = Parallel(*pushed, one.direction + 0.5 * math.pi, opened - 2.0 * FINGER_M, math.inf)
                 continue
             if len(touches) < 2:
                 around.missed(one.x, one.y, one.direction)
+                seeking.missed()
             around.add(touches, one.x, one.y, one.direction)
-            if len(touches) == 2:
-                off, at = held_by(touches)
-                spare = around.spare_m(touches) > SPARE_M
-                fits = off < FITS_RAD * (1.0 + 0.1 * many) and spare
-                off += 0.0 if spare else END_RAD
-                if (not fits, off) < best:
-                    best, found = (not fits, off), at
-                if fits:
-                    break
+            if len(touches) == 2 and seeking.is_done(touches, one):
+                break
+        found = seeking.found
         self._around = around
         self.say(f"felt {self.taps - begun} places round it: {'a' if found else 'no'} parallel grasp")
         self.state, self._most_n = before, before_n
@@ -226,11 +222,6 @@ class Feeling(Motions):
 
 
 _MIDDLE_RAD = math.radians(74.0)  # of an array
-FITS_RAD, _NEARLY = math.radians(0.5), (True, math.radians(4.0))
-SPARE_M = 1.5e-3
-"""How far from the end of a side a finger that is squeezed feels nothing of it: half the width of a contact at 1 N."""
-END_RAD = math.radians(2.0)
-"""What is parallel by touches nearer to an end is off by, squeezed, a degree or more."""
 _PUSHES_M = 4e-3
 """How far a finger that feels nothing stays behind what is wanted: some 0.06 N on its soft link; free ones 2 mm."""
 _NEAR_M, _GENTLE = 5e-3, 0.5  # how far from where it is expected a finger is slow, and by how much of the closing speed
@@ -243,13 +234,3 @@ _MISLEADS = {name for name, flag in Quality.__members__.items() if flag in DOUBT
 
 def _place(at: tuple[float, float]) -> str:
     return f"{1e3 * at[0]:.0f}, {1e3 * at[1]:.0f} mm"
-
-
-def held_by(touches: Sequence[Touch]) -> tuple[float, tuple[float, float, float]]:
-    """Return the larger friction angle of a grasp on two touches [rad], and x, y, psi of the hand there."""
-    (ax, ay), (bx, by) = (
-        (one.point[0] + FINGER_M * math.cos(one.normal), one.point[1] + FINGER_M * math.sin(one.normal))
-        for one in touches
-    )
-    off = grasp_of((ax, ay), (bx, by), *(one.normal + math.pi for one in touches)).quality
-    return off, (0.5 * (ax + bx), 0.5 * (ay + by), math.atan2(by - ay, bx - ax))

@@ -197,7 +197,7 @@ class Skills(Feeling):
         self.say(f"{found.likeness.value}-like, {_degrees(found.grasp)}: regrasp")
         felt: Six | None = None
         if self._around is not None and found.grasp.quality < _BESIDE_RAD:
-            target, sure = beside(found.grasp, found.curvatures), True
+            target, sure = self._by_class(found) or beside(found.grasp, found.curvatures), True
         else:
             target, sure = self._planned(found)
         if not sure and self.manner.taps:

@@ -33,6 +33,7 @@ _SQUEEZE = {
     "damper": (1, 0.4), "spring_rate": (1, 5.0), "filter_s": (-1, 0.05), "opening_max": (1, 0.1), "damping": (-1, 0.6),
     "age_max_s": (-1, 0.05),
 }  # fmt: skip
+_TOUCH = {"damper": (1, 0.2), "filter_s": (-1, 0.005), "age_max_s": (-1, 0.05)}
 _POWERS: dict[str, Table] = {
     "sim-axes": {
         "tick_hz": (1, 1000.0), "world_age_max_s": (-1, 0.05),
@@ -47,7 +48,7 @@ _POWERS: dict[str, Table] = {
     "sim-force": {"tick_hz": (1, 1000.0)},
     "hand": {
         "tick_hz": (1, 400.0), "lease_s": (-1, None), "late_max_s": (-1, 0.05), "pace": (1, 1.0),
-        "axis": {**_AXIS, "gain": (1, 20.0)}, "squeeze": _SQUEEZE,
+        "axis": {**_AXIS, "gain": (1, 20.0)}, "squeeze": _SQUEEZE, "touch": _TOUCH,
     },
 }  # fmt: skip
 """Of each driver: by which power of the pace a key goes, and what it is where the configuration does not say."""

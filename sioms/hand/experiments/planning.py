@@ -14,10 +14,10 @@ import numpy as np
 
 from sioms.hand.around import Around
 from sioms.hand.contacts import FINGER_M, Grasp, classify, grasp_of
-from sioms.hand.feeling import END_RAD, FITS_RAD, SPARE_M, held_by
 from sioms.hand.kinematics import Hand, Six
 from sioms.hand.regrasp import NEUTRAL, beside
-from sioms.hand.shape import Touch
+from sioms.hand.seeking import Seeking, held_by
+from sioms.hand.shape import Parallel, Touch
 from sioms.hand.skills import Skills
 from sioms.hand.touch import Felt, Manner, Reading, Sensed
 from sioms.hand.trials import Subject
@@ -84,28 +84,23 @@ def feel_round(subject: Subject, pairs: int, seed: int = 0, regrasps: int = 2) -
         seed: of the noise.
         regrasps: the first one goes where touches are parallel, each other one as the squeezed fingers tell.
     """
-    object_, around, manner = _Still(subject, seed), Around(), Manner()
-    x = y = psi = 0.0
-    best, found, many = (True, math.inf), (0.0, 0.0, 0.0), 0
+    object_, manner = _Still(subject, seed), Manner()
+    seeking, many = Seeking(around := Around()), 0
+    one: Parallel | None = Parallel(0.0, 0.0, 0.0, 0.0, math.inf)
     for many in range(pairs + 1):
-        touches = object_.tap(x, y, psi)
-        if not touches:
-            around.missed(x, y, psi)
-        else:
-            off, at = held_by(touches)
-            around.add(touches, x, y, psi)
-            psi = at[2]
-            spare = around.spare_m(touches) > SPARE_M
-            fits = off < FITS_RAD * (1.0 + 0.1 * many) and spare
-            off += 0.0 if spare else END_RAD
-            if (not fits, off) < best:
-                best, found = (not fits, off), at
-            if fits:
+        touches = object_.tap(one.x, one.y, one.direction)
+        psi = one.direction
+        if touches:
+            around.add(touches, one.x, one.y, psi)
+            psi = held_by(touches)[1][2]
+            if seeking.is_done(touches, one):
                 break
-        one = around.next(psi)
-        if one is None:
+        else:
+            around.missed(one.x, one.y, psi)
+            seeking.missed()
+        if (one := seeking.next(psi)) is None:
             break
-        x, y, psi = one.x, one.y, one.direction
+    found = seeking.found or (0.0, 0.0, 0.0)
     held = object_.touch(*found, manner)
     for _ in range(regrasps - 1):
         if held is None or held[0].quality < manner.held_rad - 3.0 * _PLACE:
