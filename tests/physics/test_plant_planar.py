@@ -312,3 +312,24 @@ def test_without_friction_an_ellipse_squeezed_on_one_half_is_lost_and_on_two_end
 def test_what_cannot_be_is_refused(call: object, wrong: str) -> None:
     with pytest.raises(ValueError, match=wrong):
         call()  # type: ignore[operator]
+
+
+def test_a_corner_is_met_by_a_finger_that_sees_one_of_its_sides_from_behind() -> None:
+    """Round sharp corners the nearest side was sought past the corner: a finger went through, 16 mm from another side."""
+    draw = random.Random(5).uniform
+    for _ in range(60):
+        points = [(draw(-0.03, 0.03), draw(-0.02, 0.02)) for _ in range(3)]
+        (ax, ay), (bx, by), (cx, cy) = points
+        twice = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        if abs(twice) < 2e-4:
+            continue
+        world = World(Body(polygon(points if twice > 0.0 else points[::-1])), [FREE], [(0.2, 0.0, 0.0)])
+        finger = world.fingers[0]
+        for _ in range(60):
+            angle, away = draw(-4.0, 4.0), draw(0.005, 0.06)
+            finger.place = [away * math.cos(angle), away * math.sin(angle), 0.3]
+            apart = world.clearances()[0]
+            if apart < -0.5e-3:
+                continue
+            world._touch(finger, 0.0)
+            assert finger.gap_m == pytest.approx(apart, abs=1e-9) if apart > 0.0 else finger.normal > 0.0

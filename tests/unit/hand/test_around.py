@@ -9,7 +9,8 @@ import pytest
 
 from sioms.hand.around import Around, met, sides_through
 from sioms.hand.experiments.planning import feel_round
-from sioms.hand.shape import Touch
+from sioms.hand.seeking import Seeking
+from sioms.hand.shape import Parallel, Touch
 from sioms.hand.trials import FAMILIES, draw
 
 DEG, MM = math.pi / 180, 1e-3
@@ -82,9 +83,37 @@ def test_how_far_touches_are_from_the_ends_of_their_sides() -> None:
     low, high = touch(20.0, -17.0, 0.0), touch(-20.0, 15.0, 180.0)
     around.add([low], 0.0, 0.0, 0.0)
     around.add([high], 0.0, 0.0, 0.0)
-    assert around.spare_m([low]) == pytest.approx(1 * MM, abs=1e-6)  # of the straight part, up to 18 mm
-    assert around.spare_m([high]) == pytest.approx(3 * MM, abs=1e-6)
-    assert around.spare_m([low, high]) == pytest.approx(1 * MM, abs=1e-6) and around.spare_m([]) == math.inf
+    assert around.spare([low]).room_m == pytest.approx(1 * MM, abs=1e-6)  # of the straight part, up to 18 mm
+    assert around.spare([high]).room_m == pytest.approx(3 * MM, abs=1e-6)
+    assert around.spare([low, high]) == (pytest.approx(1 * MM, abs=1e-6), None) and around.spare([]).room_m == math.inf
+
+
+def test_a_side_is_known_no_farther_than_it_was_touched() -> None:
+    """Nobody has met what ends the right side above: it was believed to go on as far as anything might."""
+    around = Around()
+    first, low, second = touch(20.0, 4.0, 0.0), touch(20.0, -6.0, 0.0), touch(-20.0, 0.0, 180.0)
+    below = touch(3.0, -20.0, -90.0)
+    around.add([first, second, low, below], 0.0, 0.0, 0.0)
+    assert around.spare([first]) == (pytest.approx(0.0), pytest.approx((0.0, 1.0)))
+    around.add([touch(20.0, 9.0, 0.0)], 0.0, 0.0, 0.0)
+    assert around.spare([first]).room_m == pytest.approx(5 * MM)
+
+
+def test_a_grasp_at_what_may_be_an_end_is_felt_farther_along_first() -> None:
+    for corner, done in ((18.0, True), (1.0, False)):  # the right side goes on, or ends a millimetre above
+        around = Around()
+        around.add([touch(0.0, -20.0, -90.0), touch(20.0, -15.0, 0.0)], 0.0, -15.0, 0.0)
+        seeking, one = Seeking(around), Parallel(0.0, 0.0, 0.0, 40 * MM, 0.0)
+        pair = [touch(-20.0, 0.0, 180.0), touch(20.0, 0.0, 0.0)]
+        around.add([touch(-20.0, 15.0, 180.0), touch(-20.0, -15.0, 180.0)], 0.0, 0.0, 0.0)
+        around.add(pair, 0.0, 0.0, 0.0)
+        assert not seeking.is_done(pair, one)
+        beyond = seeking.next(0.0)
+        assert beyond is not None and (beyond.x, beyond.y) == pytest.approx((0.0, 1.7 * MM), abs=1e-6)
+        normal = 0.0 if corner > 1.7 else 45.0
+        further = [touch(-20.0, 1.7, 180.0), touch(20.0 if corner > 1.7 else 19.8, 1.7, normal)]
+        around.add(further, 0.0, beyond.y, 0.0)
+        assert seeking.is_done(further, beyond) is done
 
 
 @pytest.mark.parametrize("half_mm", [-10.0, 0.1, 0.6], ids=["moved by the first touch", "a foil", "a sheet"])
