@@ -8,12 +8,13 @@ then has a table ``shape``:
     load_node = "lord1.fz"               # optional: a force sensor under the finger
     load_scale = 50.0                    # N/m for a newton: one over the length of contact in metres
 
-``mean_frames`` in that table adds ``mean``: the shape of the mean of so many frames, one mean after the other, stamped as
-the last of them, by an estimator that knows how much less noise it has: contacts too light for a single frame.
+``mean_frames`` in that table adds ``mean``: the shape of the mean of so many frames, one mean after the other, stamped
+as the last of them, by an estimator that knows how much less noise it has: contacts too light for a single frame.
 
-Requests on ``strain``, ``shape`` and ``mean``: ZERO_DEVICE takes a new baseline from the next frames and is answered when it is
-in force, or refused when something touches or the elements fail; CALIBRATE_DEVICE with the text of a finger's file
-loads that finger, without an argument its own again; on ``strain`` SET_GAINS and GET_GAINS hold strain per output.
+Requests on ``strain``, ``shape`` and ``mean``: ZERO_DEVICE takes a new baseline from the next frames and is answered
+when it is in force, or refused when something touches or the elements fail; CALIBRATE_DEVICE with the text of a
+finger's file loads that finger, without an argument its own again; on ``strain`` SET_GAINS and GET_GAINS hold strain
+per output.
 
 The physics is imported when there is a finger: it brings scipy, which takes a second, and drivers of many other sensors
 have this part, too.

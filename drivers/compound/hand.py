@@ -3,8 +3,8 @@
 A device made of devices, see drivers/compound/README.md. With a table ``squeeze`` d takes force commands: an internal
 force [N], positive squeezes. In free space d then yields as a virtual spring about where it was, in contact it follows
 the damper law (sioms.hand.control), with the force that the fingers' own estimates or wrist sensors tell. With a table
-``touch`` commands of d may say a greatest force: as long as it holds, each finger yields by itself (sioms.hand.yielding),
-and the node ``touch`` shows what each feels. The node
+``touch`` commands of d may say a greatest force: as long as it holds, each finger yields by itself
+(sioms.hand.yielding), and the node ``touch`` shows what each feels. The node
 ``force`` shows that force and how late all this is, the node ``model`` what the hand is known to be: what is stated, or
 what ``model_file`` says, which ``sioms reconcile hand`` writes. hand.toml is an example without a sense of
 touch, etc/hand.toml a whole hand with fingers that feel.

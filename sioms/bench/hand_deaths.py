@@ -2,9 +2,9 @@
 
 The cell is simulated, in slow motion (`sioms.hand.slow`), so that it runs on a machine that is shared; its leases are
 those of pace 1. Wrist sensors tell the force: what is tried is who notices whose death, and estimators would only take
-time. A round grasps by the hand's own force command, carries the object to and fro, does away with something, and looks
-at the modules that are left: when they are commanded to move last, and when they move last. What was stopped then goes
-on, and no module may move by it.
+time. A round grasps by the hand's own force command and carries the object to and fro, or goes on to it with one finger
+that yields under a greatest force; then it does away with something, and looks at the modules that are left: when they
+are commanded to move last, and when they move last. What was stopped then goes on, and no module may move by it.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from .options import Options
 
 PACE = 0.1
 FORCE_N, SPEED = 0.5, 0.01 * PACE
+TOUCH_N = 0.06
 LEASE_S, DRIVER_S, DAEMON_S, AGE_S = 0.25, 0.5, 0.5, 0.25
 """Leases of the program, of what a driver reads of another, of the daemon; age at which a force is none."""
 MARGIN_S = 0.35
@@ -93,7 +94,7 @@ def tables() -> dict[str, Any]:
     names = (("x", 0.3), ("y", 0.3), ("psi", 2.0), ("d", 0.4), ("phi1", 2.0), ("phi2", 2.0))
     devices["hand"] = {
         "driver": "hand", "axes": list(MODULES), "link_stiffness": 3.0, "history": 1024,
-        "squeeze": {"wrists": ["wrist1", "wrist2"]},
+        "squeeze": {"wrists": ["wrist1", "wrist2"]}, "touch": {"wrists": ["wrist1", "wrist2"]},
         "axis": [{"name": name, "velocity_max": v, "acceleration_max": 10.0 * v, "gain": 10.0, "force_max": 4.0,
                   "watch": {"uncommanded": False, "tolerance": 1.0}} for name, v in names],
     }  # fmt: skip
@@ -101,7 +102,8 @@ def tables() -> dict[str, Any]:
     for device in found["device"].values():
         device.pop("process", None)  # each dies alone
         device |= {"lease_s": DRIVER_S, "realtime_priority": 10}
-    found["device"]["hand"]["squeeze"]["age_max_s"] = AGE_S
+    for table in ("squeeze", "touch"):
+        found["device"]["hand"][table]["age_max_s"] = AGE_S
     return found
 
 
@@ -124,14 +126,33 @@ def _axis(name: str, unit: str, mass: float, viscous: float, velocity: float, st
     }  # fmt: skip
 
 
+def toucher(daemon: Daemon, velocity: float) -> Callable[[], None]:
+    """Return what a program does that goes on to the object with the left finger, which yields."""
+
+    def program() -> None:
+        hand, _ = _begun(daemon)
+        speed = abs(velocity)
+        hand.write([command(0, velocity=0.5 * speed), command(3, velocity=-speed, max_force=TOUCH_N)])
+        while True:
+            time.sleep(LEASE_S / 5)
+            hand.keepalive()
+
+    return program
+
+
+def _begun(daemon: Daemon) -> tuple[Any, Any]:
+    """Return the hand of a program that has just begun, and its session."""
+    with contextlib.suppress(OSError):  # as its devices, where it may
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    cell = daemon.cell("holder")
+    return cell.open("hand", "rw", 10.0, lease=LEASE_S), cell
+
+
 def holder(daemon: Daemon, velocity: float) -> Callable[[], None]:
     """Return what a program does that squeezes, and then carries what it holds along x."""
 
     def program() -> None:
-        with contextlib.suppress(OSError):  # as its devices, where it may
-            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
-        cell = daemon.cell("holder")
-        hand = cell.open("hand", "rw", 10.0, lease=LEASE_S)
+        hand, cell = _begun(daemon)
         force = cell.open("hand.force")
         hand.write(command(3, force=FORCE_N))
         while abs(float(force.read().data[0]) - FORCE_N) > 0.3 * FORCE_N:
@@ -207,7 +228,8 @@ def _round(daemon: Daemon, cell: Any, home: list[float], what: str, chance: rand
     _ready(cell, home)
     with ExitStack() as stack:
         nodes = {name: stack.enter_context(cell.open(f"{name}.readonly")) for name in MODULES}
-        program = _held(daemon, cell, home, nodes, SPEED * chance.choice((-1.0, 1.0)))
+        does = chance.choice((HOLDS, TOUCHES))
+        program = _held(daemon, cell, home, nodes, SPEED * chance.choice((-1.0, 1.0)), does)
         stack.callback(_end, daemon, program)
         time.sleep(chance.uniform(0.0, 0.1))
         who, _, how = what.partition(" ")
@@ -231,21 +253,25 @@ def _round(daemon: Daemon, cell: Any, home: list[float], what: str, chance: rand
         return moved or Rest(max(rest.told_ns for rest in rests), max(rest.moved_ns for rest in rests))
 
 
-def _held(daemon: Daemon, cell: Any, home: list[float], nodes: Mapping[str, Any], velocity: float) -> int:
-    """Have a program hold and carry; return its pid. One that the machine kept from renewing its lease is replaced."""
+def _held(
+    daemon: Daemon, cell: Any, home: list[float], nodes: Mapping[str, Any], velocity: float, does: Does
+) -> int:  # fmt: skip
+    """Have a program hold and carry, or touch; return its pid. One that the machine kept from renewing its lease is
+    replaced.
+    """
     for _ in range(_TRIES):
-        program = daemon.fork(holder(daemon, velocity))
-        if _begins(cell, nodes, program):
+        program = daemon.fork(does.program(daemon, velocity))
+        if _begins(cell, nodes, program, does):
             return program
         _end(daemon, program)
         _ready(cell, home)
     raise TimeoutError(f"hold: {_TRIES} programs lost the hand or did not come to carry; want a quieter machine")
 
 
-def _begins(cell: Any, nodes: Mapping[str, Any], program: int) -> bool:
-    """Wait until the hand carries what it holds; return False when it does not, or its program has ended."""
-    with cell.open("hand.force") as force, contextlib.suppress(TimeoutError):
-        wait_for(lambda: _carries(force, nodes) or not lives(program), 4.0 / PACE, "the hand to carry what it holds")
+def _begins(cell: Any, nodes: Mapping[str, Any], program: int, does: Does) -> bool:
+    """Wait until the hand does it; return False when it does not, or its program has ended."""
+    with cell.open(does.node) as shown, contextlib.suppress(TimeoutError):
+        wait_for(lambda: does.has_begun(shown, nodes) or not lives(program), 4.0 / PACE, f"the hand to {does.what}")
         return lives(program)
     return False
 
@@ -305,6 +331,25 @@ def _carries(force: Any, nodes: Mapping[str, Any]) -> bool:
     rates = [float(node.read().commanded_velocity[0]) for node in nodes.values()]
     goes = all(abs(abs(rate) - SPEED) < 0.3 * SPEED for rate in rates) and rates[0] * rates[1] > 0.0
     return goes and abs(float(force.read().data[0]) - FORCE_N) < 0.3 * FORCE_N
+
+
+def _touches(touch: Any, nodes: Mapping[str, Any]) -> bool:
+    """Return whether the left finger touches the object and presses on."""
+    rate = float(nodes["left"].read().commanded_velocity[0])
+    return float(touch.read().data[0]) == 1.0 and rate > 0.25 * SPEED
+
+
+class Does(NamedTuple):
+    """What a hand does in a round: the program, the node that shows whether it does it, and how that is seen."""
+
+    what: str
+    program: Callable[[Daemon, float], Callable[[], None]]
+    node: str
+    has_begun: Callable[[Any, Mapping[str, Any]], bool]
+
+
+HOLDS = Does("carry what it holds", holder, "hand.force", _carries)
+TOUCHES = Does("touch with one finger", toucher, "hand.touch", _touches)
 
 
 def _resting(node: Any, after: int, since_ns: int) -> Rest:

@@ -89,9 +89,7 @@ class Motions:
             # light fingers bounce: the goal does not run away from where they are
             self._goal[3] = apart if both else max(self._goal[3], apart - _AHEAD_M)
             pressed_s = (pressed_s + gone_s * pressed) if both else 0.0
-            since = [
-                0.0 if self._feels(i).touched else past + gone_s for i, past in enumerate(since)
-            ]
+            since = [0.0 if self._feels(i).touched else past + gone_s for i, past in enumerate(since)]
             if self._goal[3] < manner.opening[0] and not both:
                 raise Failed(
                     Fault.TOO_SMALL if one or two else Fault.NOTHING_THERE,

@@ -315,7 +315,7 @@ def test_what_cannot_be_is_refused(call: object, wrong: str) -> None:
 
 
 def test_a_corner_is_met_by_a_finger_that_sees_one_of_its_sides_from_behind() -> None:
-    """Round sharp corners the nearest side was sought past the corner: a finger went through, 16 mm from another side."""
+    """Round sharp corners the nearest side was sought past the corner: a finger went through it."""
     draw = random.Random(5).uniform
     for _ in range(60):
         points = [(draw(-0.03, 0.03), draw(-0.02, 0.02)) for _ in range(3)]

@@ -85,9 +85,11 @@ def feel_round(subject: Subject, pairs: int, seed: int = 0, regrasps: int = 2) -
         regrasps: the first one goes where touches are parallel, each other one as the squeezed fingers tell.
     """
     object_, manner = _Still(subject, seed), Manner()
-    seeking, many = Seeking(around := Around()), 0
+    seeking = Seeking(around := Around())
     one: Parallel | None = Parallel(0.0, 0.0, 0.0, 0.0, math.inf)
-    for many in range(pairs + 1):
+    many = -1  # after the first
+    while one is not None and many < pairs:
+        many += 1
         touches = object_.tap(one.x, one.y, one.direction)
         psi = one.direction
         if touches:
@@ -98,8 +100,7 @@ def feel_round(subject: Subject, pairs: int, seed: int = 0, regrasps: int = 2) -
         else:
             around.missed(one.x, one.y, psi)
             seeking.missed()
-        if (one := seeking.next(psi)) is None:
-            break
+        one = seeking.next(psi)
     found = seeking.found or (0.0, 0.0, 0.0)
     held = object_.touch(*found, manner)
     for _ in range(regrasps - 1):

@@ -45,8 +45,8 @@ _FIRST_S = 10.0
 _WATCHED = 40
 _ENOUGH = 0.5
 MANNER = Manner(light_n=0.4, tap_n=0.06, tap_frames=480)
-"""Light touches are a little firmer than on the plane, and felt for longer: a frame of a live finger tells a contact from
-0.14 N on, a mean of 40 from 0.02 N on, and the platen holds an object against one finger with 0.1 to 0.2 N."""
+"""Light touches are a little firmer than on the plane, and felt for longer: a frame of a live finger tells a contact
+from 0.14 N on, a mean of 40 from 0.02 N on, and the platen holds an object against one finger with 0.1 to 0.2 N."""
 _TOUCH = ("touched1", "touched2", "force1", "force2")
 _BLIND = Felt(None)
 
@@ -196,7 +196,11 @@ class CellHand:
         ages = [max((now_ns - stamp_ns) * pace_s, 0.0) for stamp_ns in self._stamps_ns]
         one, two = (self.model.corrected(felt, i) for i, felt in enumerate(self.told))
         return Reading(
-            time_s, self.hand.inverse(self._at), (one, two), (ages[0], ages[1]), light=self._lightly() if self._light else None
+            time_s,
+            self.hand.inverse(self._at),
+            (one, two),
+            (ages[0], ages[1]),
+            light=self._lightly() if self._light else None,
         )
 
     def _lightly(self) -> tuple[Felt, Felt]:
@@ -244,7 +248,7 @@ def _watched(cell: Workcell, force: str, fingers: Sequence[str]) -> float:
 
 
 def _record(axis: int, presses: bool, value: float, pace: float, most_n: float) -> bytes:
-    """Return a command of a force [N], or of a velocity in the hand's time; with a greatest force [N], if it is finite."""
+    """Return a command of a force [N], or of a velocity in the hand's time; a greatest force [N] if it is finite."""
     fields: list[Any] = [0] * len(_NAMES)
     fields[0], fields[_MODE] = axis, _PRESS if presses else _JOG
     if most_n < math.inf:

@@ -28,7 +28,7 @@ def centres(rates: object) -> list[tuple[float, float]]:
 
 
 def links(rates: object) -> list[float]:
-    x, y, psi, d, phi1, phi2 = rates  # type: ignore[misc]
+    _, _, psi, _, phi1, phi2 = rates  # type: ignore[misc]
     return [psi - phi1, psi - phi2]
 
 
