@@ -29,7 +29,6 @@ def _config(pace: float) -> str:
     """Return the cell of etc/hand.toml with the fingers at a millimetre from a disk."""
     tables = tomllib.loads((ETC / "hand.toml").read_text(encoding="utf-8"))
     devices: dict[str, Any] = tables["device"]
-    del devices["wrist1"], devices["wrist2"]
     devices["world"]["object"] = {"shape": "disk", "radius_m": 0.02, "pose": [0.0, 0.002, 0.0]}
     for side, sign in (("left", -1.0), ("right", 1.0)):
         devices[side]["axis"][0]["motor"]["start"] = sign * 0.0337

@@ -110,6 +110,8 @@ class CellHand:
             self._number, self._time_s = 0, 0.0
             self._begin_ns = time.monotonic_ns()
             self.reading = self._read()
+            while self._time_s < _FIRST_S and any(one.touched is None for one in self.reading.light or ()):
+                self.reading = self._read()  # the first mean is still to come
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
