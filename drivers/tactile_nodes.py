@@ -125,6 +125,12 @@ class TactileNodes:
         blocks: strain, shape and, where it is wanted, mean.
     """
 
+    _sensor: ShapeSensor
+    _averaging: ShapeSensor
+    """Of means; only where there are some."""
+    _sum: Array
+    _summed: int
+
     def __init__(self, settings: ShapeSettings, blocks: Sequence[BlockSpec], kit: Kit) -> None:
         from sioms.tactile.sensing import numbers
 
