@@ -196,11 +196,6 @@ class Motions:
         except ValueError as error:
             raise Failed(Fault.SINGULAR, f"{what}: {error}") from None
         for i, (finger, age_s) in enumerate(zip(self.now.fingers, self.now.ages_s, strict=True)):
-            if self._most_n < math.inf and self._feels(i).touched is None:
-                raise Failed(
-                    Fault.STALE,
-                    f"{what}: nothing tells what finger {i + 1} touches; want its force sensor, which yielding needs",
-                )
             unknown = not math.isfinite(finger.force)
             if not age_s <= manner.stale_s or finger.touched is None or unknown:
                 why = "its force is not known" if unknown else "it is blind"
@@ -209,6 +204,11 @@ class Motions:
                 raise Failed(
                     Fault.STALE,
                     f"{what}: finger {i + 1} cannot be relied on: {why}; want a frame every {manner.stale_s:g} s",
+                )
+            if self._most_n < math.inf and self._feels(i).touched is None:
+                raise Failed(
+                    Fault.STALE,
+                    f"{what}: nothing tells what finger {i + 1} touches; want its force sensor, which yielding needs",
                 )
             if finger.force > manner.most_n:
                 raise Failed(

@@ -15,14 +15,14 @@ import pytest
 from sioms.hand.plane import PlaneHand, Rig
 from sioms.hand.running import carried_out
 from sioms.hand.shape import Touch
-from sioms.hand.skills import Skills
+from sioms.hand.skills import Skills, _touches
 from sioms.hand.touch import Failed, Fault, Felt, Manner, Reading, Sensed, Setpoint, State
 from sioms.plant.outline import polygon
 from sioms.plant.planar import Body
 
 MM = 1e-3
 RIG = Rig(every=4, compiled=False, free_m=1e-3, open_m=0.1)
-MANNER = Manner(force_n=0.5, frames=10)
+MANNER = Manner(force_n=0.5, frames=10, tap_frames=20)
 HULL = polygon([(-24 * MM, -14 * MM), (20 * MM, -20 * MM), (26 * MM, 6 * MM), (-6 * MM, 24 * MM)], 2 * MM)
 STATES = (State.OPEN, State.CLOSE, State.SENSE, State.FEEL, State.ROLL, State.HOLD)
 """Those in which the hand moves or waits; IDLE, CLASSIFY and REGRASP take no tick of their own."""
@@ -59,12 +59,19 @@ class Trial:
         carried_out(self.ticks, self.tick, self.hand.reading.time_s, 60.0)
 
 
+def _round(skills: Skills, found: Sensed) -> Generator[Setpoint, Reading, Any]:
+    """Open and feel round the object, whatever a plan of the regrasp would be."""
+    yield from skills._open()
+    return (yield from skills._feel_round(_touches(found)))
+
+
 def trial(state: State, harm: Callable[[Trial, Reading], Reading]) -> Trial:
     """Return a skill that comes to a state."""
     hand, skills, found = copy.deepcopy(_grasped())
     ticks: Any = {
         State.OPEN: skills.release, State.CLOSE: lambda: skills.regrasp(found), State.SENSE: skills.feel,
-        State.FEEL: lambda: skills.regrasp(found), State.ROLL: skills.roll, State.HOLD: lambda: skills.hold(0.5),
+        State.FEEL: lambda: skills._guarded("regrasp", _round(skills, found)), State.ROLL: skills.roll,
+        State.HOLD: lambda: skills.hold(0.5),
     }[state]  # fmt: skip
     skills.manner = replace(MANNER, taps=0 if state is State.CLOSE else 14, frames=60 if state is State.SENSE else 10)
     return Trial(hand, skills, ticks(), harm, state)

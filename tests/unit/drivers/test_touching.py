@@ -132,9 +132,7 @@ def test_a_touch_of_one_finger_tells_the_place_and_moves_nothing() -> None:
     skills._most_n = MANNER.yield_n
     touch, pushed = cell.run(skills._tap(0, NEAR - AWAY_M))
     assert pushed is None and touch is not None and skills.taps == 1
-    assert (
-        math.dist(before[:2], cell.world.pose[:2]) < 0.1e-3
-    )  # 1 to 4 mm where none yields
+    assert math.dist(before[:2], cell.world.pose[:2]) < 0.1e-3  # 1 to 4 mm where none yields
     assert math.dist(touch.point, cell.world.pose[:2]) == pytest.approx(RADIUS_M, abs=0.1e-3)
     centre = math.atan2(touch.point[1] - cell.world.pose[1], touch.point[0] - cell.world.pose[0])
     assert math.remainder(touch.normal - centre, math.tau) == pytest.approx(0.0, abs=math.radians(0.5))
