@@ -123,5 +123,5 @@ def test_alarms_and_rights_stay() -> None:
 def test_a_file_that_is_no_toml_is_named(tmp_path: Path) -> None:
     (tmp_path / "cell.toml").write_text("Debian 12\n")
     args = argparse.Namespace(config=tmp_path / "cell.toml", pace=0.5, output=None)
-    with pytest.raises(ValueError, match=r"read .*cell\.toml: Expected '='"):
+    with pytest.raises(ValueError, match=r"read .*cell\.toml: line 1: Debian 12: expected '='"):
         command.run(args)
