@@ -20,10 +20,12 @@ _ENTRY = Struct("<HHI")
 _USER_OBJ, _USER, _GROUP_OBJ, _GROUP, _MASK, _OTHER = 0x01, 0x02, 0x04, 0x08, 0x10, 0x20
 _WRITE, _READ_WRITE, _NOBODY = 2, 6, 0xFFFFFFFF
 _ACL = "system.posix_acl_access"
+_NEW = ".new"
+"""End of the name of a file that is to take the place of another."""
 
 
 class StopFiles:
-    """The two files of a daemon.
+    """The two files of a daemon, which nobody finds before ``show``.
 
     Args:
         path: of the daemon's socket.
@@ -39,16 +41,22 @@ class StopFiles:
 
     def __init__(self, path: str) -> None:
         self._path = path
-        self.remove()
-        self.fd = self._make(path + REQUEST, 0o600)
-        self.taken_fd = self._make(path + TAKEN, 0o644)
+        self.fd = self._make(REQUEST, 0o600)
+        self.taken_fd = self._make(TAKEN, 0o644)
         self.client_fds = [
-            os.open(path + REQUEST, os.O_WRONLY | os.O_CLOEXEC),
-            os.open(path + TAKEN, os.O_RDONLY | os.O_CLOEXEC),
+            os.open(path + REQUEST + _NEW, os.O_WRONLY | os.O_CLOEXEC),
+            os.open(path + TAKEN + _NEW, os.O_RDONLY | os.O_CLOEXEC),
         ]
 
-    @staticmethod
-    def _make(path: str, mode: int) -> int:
+    def show(self) -> None:
+        """Have them take the place of those of the daemon before."""
+        for end in (TAKEN, REQUEST):  # who finds the second finds both
+            os.rename(self._path + end + _NEW, self._path + end)
+
+    def _make(self, end: str, mode: int) -> int:
+        path = self._path + end + _NEW
+        with suppress(FileNotFoundError):
+            os.unlink(path)
         fd = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC, 0o600)
         os.fchmod(fd, mode)
         os.pwrite(fd, bytes(256), 0)
@@ -87,27 +95,14 @@ class StopFiles:
                 os.unlink(self._path + end)
 
 
-def left(path: str) -> tuple[int, str]:
-    """Return the word of the last stop that was asked for by files which another daemon has left, 0: there is none; and
-    who asked, if nobody has said that he has obeyed it, else ''.
-    """
-    fds: list[int] = []
+def left(path: str) -> StopRequest | None:
+    """Return the stop-request file that another daemon has left; None: there is none."""
     try:
-        for end in (REQUEST, TAKEN):
-            fds.append(os.open(path + end, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC))
-            about = os.fstat(fds[-1])
-            if not stat.S_ISREG(about.st_mode) or about.st_uid != os.getuid():
-                return 0, ""
-        request = StopRequest(fds[0], os.dup(fds[1]))
-        fds.pop(0)
-        word = request.mark[0]
-        # Of a later word nobody has said so either: that may be of before a restart of the machine.
-        return word, request.source if word not in (0, request.obeyed) else ""
+        fd = os.open(path + REQUEST, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError:
-        return 0, ""
-    finally:
-        for fd in fds:
-            os.close(fd)
+        return None
+    request, about = StopRequest(fd, -1), os.fstat(fd)
+    return request if stat.S_ISREG(about.st_mode) and about.st_uid == os.getuid() else None
 
 
 def access_list(uids: Iterable[int], gids: Iterable[int]) -> bytes:

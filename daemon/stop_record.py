@@ -63,7 +63,6 @@ class StopRecord:
         size = os.fstat(self._fd).st_size
         start = max(_first_byte(self._fd, size), size - LARGEST)
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
-        self.state.requested = 0  # of a file that is there no more
         self.by_drivers: list[Mapping[str, Any]] = []
         self.asked = PartTimes()
         self._at = size
@@ -122,7 +121,7 @@ class StopRecord:
         """Close the file, and take it away when nothing is stopped."""
         self.look()  # drivers may have noted something at their end
         self._flusher.end()
-        if not self.state.workcell and not self.state.parts:
+        if not (self.state.workcell or self.state.requested or self.state.parts):
             os.unlink(self.path)
         os.close(self.drivers_fd)
         self._journal.close()

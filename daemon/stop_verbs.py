@@ -40,7 +40,7 @@ class StopVerbs:
 
     def emergency_stop(self, session: Session, message: EmergencyStop) -> None:
         """Stop the workcell, or a node."""
-        name, why, or_all = message
+        name, why, or_all, word = message
         source = f"{session}" + (f": {printable(why, 80)}" if why else "")
         if not name:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
@@ -48,7 +48,7 @@ class StopVerbs:
                     errno.EPERM,
                     f"emergency stop: {session.peer.user} has no right to stop; ask for a [[grant]]",
                 )
-            self._stops.stop_for(session.peer.pid, source, session.number)
+            self._stops.stop_for(session.peer.pid, word, source, session.number)
             return
         try:
             node = self._nodes.find(session, "emergency stop", name, message.right)
@@ -58,7 +58,7 @@ class StopVerbs:
             if not self._clients.rights.on_workcell(session.peer) & message.right:
                 raise
             missing = f"{source} (of {printable(name, 80)}, which there is not)"
-            self._stops.stop_for(session.peer.pid, missing, session.number)
+            self._stops.stop_workcell(missing, session.number)
             raise Refused(errno.ENOENT, f"{error}; the whole workcell has been stopped instead") from None
         try:
             self._stops.stop_node(node, source, session.number)

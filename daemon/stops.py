@@ -64,7 +64,7 @@ class Stops:
         self._wake_drivers()
         self._shared.record.look()
         if not known or not self._shared.record.state.workcell:
-            self._note(workcell_entry(source, stop=True, named=True, resets=latch.resets))
+            self._note(workcell_entry(source, stop=True, named=True))
 
     def hear_request(self) -> str:
         """Obey the stop-request file; return who has asked for a stop that nobody had heard yet, '' for nobody.
@@ -75,28 +75,32 @@ class Stops:
         if (mark := request.mark) == self._request_seen:
             return ""
         self._request_seen = mark
-        source, heard = request.source, request.taken(mark[0])
+        source, heard = request.source, request.obeyed == mark
         self.stop_workcell(source, asked_ns=self._written_ns(mark))
         request.take(mark)
         return "" if heard else source
 
     def _written_ns(self, mark: tuple[int, int]) -> int:
-        """Return when a request was written to the file [ns, CLOCK_MONOTONIC]: as its word says, if the time of the
-        file's change does not contradict it; else at the latest; 0: that is not known.
+        """Return when a request was written to the file [ns, CLOCK_MONOTONIC]: as its word says, or the time of the
+        file's change, if that is later, and they do not contradict each other; else at the latest; 0: that is not
+        known.
         """
         word, changed_ns = mark
         written_ns = self._cell.timestamps.monotonic_ns(changed_ns)
         if written_ns and abs(word - written_ns) < FILE_CLOCK_NS:
-            return word
+            return min(max(word, written_ns), time.monotonic_ns())
         return written_ns and min(written_ns + FILE_CLOCK_NS, time.monotonic_ns())
 
-    def stop_for(self, pid: int, source: str, by: int = 0) -> None:
-        """Stop the workcell for a session. A request that its process has made, and nobody heard yet, is the same stop:
-        clients write one ahead, for the drivers, in case that we hang.
+    def stop_for(self, pid: int, word: int, source: str, by: int = 0) -> None:
+        """Stop the workcell for a session. A request of this word, if its process has made it and nobody has heard it
+        yet, is the same stop: clients write one ahead, for the drivers, in case that we hang. What another session of
+        that process has asked for is another.
         """
         request = self._shared.request
         mark = request.mark
-        is_same = request.pid == pid and request.mark == mark  # else somebody is just writing
+        is_same = mark[0] == word != 0 and request.pid == pid and request.mark == mark  # else somebody is just writing
+        if is_same and mark == self._shared.latch.answered_request:
+            return  # who has reset it had seen it
         if is_same:
             self._request_seen = mark
         else:
@@ -115,11 +119,10 @@ class Stops:
         """
         latch, record, answered = self._shared.latch, self._shared.record, self._request_seen
         record.look()
-        words = [answered[0]]
-        if self._shared.request.mark == answered:  # then what drivers have read there was before it, whatever its word
-            words += record.state.requested, self._shared.left_word
-        word = max((word for word in words if word <= time.monotonic_ns()), default=0)  # anybody can write any
-        entry = workcell_entry(who, stop=False, resets=latch.resets + 1, request=word)
+        marks = [answered, *self._shared.left]
+        if self._shared.request.mark == answered:  # then what drivers have read there was before it, whatever its mark
+            marks += record.state.requested
+        entry = workcell_entry(who, stop=False, resets=latch.resets + 1, requests=marks)
         self._note(entry)  # first: a later stop is noted after it
         sent_ns = max(sent_ns, record.asked.own_of_any_ns(by))
         latch.reset(time.monotonic_ns(), answered, sent_ns)

@@ -262,7 +262,7 @@ class BitCell(Cell):
                 return not message[2]
 
     def do_stop(self, c: int, node: str) -> bool:
-        return self.ask(c, ClientVerb.EMERGENCY_STOP, node, "", False)[0]
+        return self.ask(c, ClientVerb.EMERGENCY_STOP, node, "", False, 0)[0]
 
     def do_reset(self, c: int, node: str) -> bool:
         return self.ask(c, ClientVerb.RESET, node)[0]

@@ -235,13 +235,13 @@ class Cell:
         return self._ask(c, ClientVerb.CLOSE, self.clients[c].numbers[d])
 
     def stop(self, c: int) -> str:
-        return self._ask(c, ClientVerb.EMERGENCY_STOP, "", "", False)
+        return self._ask(c, ClientVerb.EMERGENCY_STOP, "", "", False, 0)
 
     def reset(self, c: int) -> str:
         return self._ask(c, ClientVerb.RESET, "")
 
     def stop_node(self, c: int, d: int) -> str:
-        return self._order(c, d, ClientVerb.EMERGENCY_STOP, NAMES[d], "", False)
+        return self._order(c, d, ClientVerb.EMERGENCY_STOP, NAMES[d], "", False, 0)
 
     def reset_node(self, c: int, d: int) -> str:
         return self._order(c, d, ClientVerb.RESET, NAMES[d])
@@ -254,10 +254,10 @@ class Cell:
             other.stops.heed_orders()
         return answer
 
-    def request_stop(self, c: int) -> None:
+    def request_stop(self, c: int, late_ns: int = 0) -> None:
         request = open_stop_request(self.path)
         assert request is not None
-        request.request(CLOCK(), self.clients[c].pid)
+        request.request(CLOCK() - late_ns, self.clients[c].pid)
         request.close()
 
     def suspend(self, c: int) -> None:
@@ -271,7 +271,7 @@ class Cell:
         if client.sock is not None:
             self.dead[c] = client
             if words == 3:
-                client.ask(ClientVerb.EMERGENCY_STOP, "", "", False)
+                client.ask(ClientVerb.EMERGENCY_STOP, "", "", False, 0)
             elif words:
                 client.ask(ClientVerb.OPEN, NAMES[words - 1], 3, None, LEASE_S)
         client.end()
@@ -438,7 +438,7 @@ class Cell:
         self.record.look()  # type: ignore[union-attr]
         state, latch = server.cell.shared.record.state, server.cell.shared.latch
         stopped = bool(latch.stopped_ns) or self._view_request() == 2
-        assert stopped == bool(state.workcell), "latch, requests and journal agree"
+        assert stopped == bool(state.workcell or state.requested), "latch, requests and journal agree"
         stopped_nodes = {name for name, *_ in state.nodes()}
         devices = tuple(self._view_device(d, model) for d in range(DEVICES))
         sessions = {s.peer.pid: s for s in server.clients.sessions}
@@ -473,7 +473,7 @@ class Cell:
     def _view_request(self) -> int:
         request = self._server.cell.shared.request
         mark = request.mark
-        return 0 if mark == self._server.stops._request_seen else 2 if request.taken(mark[0]) else 1
+        return 0 if mark == self._server.stops._request_seen else 2 if request.obeyed == mark else 1
 
     def _view_device(self, d: int, model: State) -> Any:
         expected, device = model.devices[d], self._device(d)

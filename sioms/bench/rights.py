@@ -248,8 +248,8 @@ def _markers_of_others(scene: _Scene) -> bool:
 
 def _verbs_not_granted(scene: _Scene) -> bool:
     asks: list[verbs.Message] = [
-        *(verbs.EmergencyStop(node, "mine", False) for node in ("", "mod0", "mod1")),
-        verbs.EmergencyStop("mod9", "mine", True),
+        *(verbs.EmergencyStop(node, "mine", False, 0) for node in ("", "mod0", "mod1")),
+        verbs.EmergencyStop("mod9", "mine", True, 0),
         verbs.Supervise(0.05), verbs.Reset("mod0"), verbs.Reset("mod1"), verbs.Reload(), verbs.Journal(""),
         verbs.Journal("mod0"), verbs.Acknowledge("mod0", "mine"), verbs.TellAlarm("mod0.a0", "hot", 2, "mine"),
         verbs.TellAlarm("mod1.a0", "hot", 2, "mine"), verbs.Info("mod0"),
@@ -261,7 +261,8 @@ def _verbs_not_granted(scene: _Scene) -> bool:
 def _stops_by_their_port(scene: _Scene) -> bool:
     with Attacker(scene.gateway, scene.pair, stops=True) as attacker:
         attacker.frame(Up.HELLO)
-        return attacker.ask(verbs.EmergencyStop(scene.dice.choice(("", "mod0", "mod1", "mod9")), "mine", True))[0] == 0
+        node = scene.dice.choice(("", "mod0", "mod1", "mod9"))
+        return attacker.ask(verbs.EmergencyStop(node, "mine", True, 0))[0] == 0
 
 
 def _names_of_others(scene: _Scene) -> bool:

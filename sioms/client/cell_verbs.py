@@ -78,8 +78,26 @@ def open_call(name: str, mode: str, timeout: float | None, lease: float) -> Call
     return Call(f"open {name}", verbs.Open(name, int(access), timeout, lease), limit_s=timeout)
 
 
-def request_stop(request: StopRequest | None, why: str) -> Callable[[], bool] | None:
-    """Request a stop of the workcell past the daemon; return what tells whether it has been taken.
+class Asked:
+    """A stop of the workcell that is requested past the daemon; called, it tells whether it has been taken.
+
+    Attributes:
+        word: what stands for it in the stop-request file.
+    """
+
+    __slots__ = ("_mark", "_request", "word")
+
+    def __init__(self, request: StopRequest, why: str) -> None:
+        self._request = request
+        self._mark = request.request(monotonic_ns(), os.getpid(), why)
+        self.word = self._mark[0]
+
+    def __call__(self) -> bool:
+        return self._request.taken(self._mark)
+
+
+def request_stop(request: StopRequest | None, why: str) -> Asked | None:
+    """Request a stop of the workcell past the daemon.
 
     Comes before the request to the daemon: what is written after it may be found after a reset, as a new stop.
 
@@ -87,10 +105,13 @@ def request_stop(request: StopRequest | None, why: str) -> Callable[[], bool] | 
         request: the stop-request file; None: this client has no right to it, or does not want it.
         why: for the log.
     """
-    if request is None:
-        return None
-    word = request.request(monotonic_ns(), os.getpid(), why)
-    return lambda: request.taken(word)
+    return None if request is None else Asked(request, why)
+
+
+def stop_call(node: str, why: str, or_all: bool, asked: Asked | None) -> Call:
+    """Return the request for a stop to the daemon, which is the same as one that has been made past it, if any has."""
+    message = verbs.EmergencyStop(node, why, or_all, asked.word if asked else 0)
+    return Call("emergency stop", message, enough=asked)
 
 
 class WorkcellVerbs(Session[M]):
@@ -337,10 +358,10 @@ class WorkcellVerbs(Session[M]):
         await self._stop(node, why, or_all)
 
     async def _stop(self, node: str, why: str, or_all: bool = False) -> None:
-        call = Call("emergency stop", verbs.EmergencyStop(node, printable(str(why)), or_all))
-        taken = call.enough = request_stop(None if node else self._request, printable(str(why)))
+        why = printable(str(why))
+        taken = request_stop(None if node else self._request, why)
         try:
-            await self._waiter.call(call)
+            await self._waiter.call(stop_call(node, why, or_all, taken))
         except OSError:
             if taken is None or not taken():
                 raise  # else the drivers have latched it without the daemon

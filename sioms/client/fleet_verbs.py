@@ -13,7 +13,7 @@ from sioms.protocol.flags import Request
 from sioms.protocol.text import printable
 
 from .arguments import number as as_number
-from .cell_verbs import NodeEntry, WorkcellVerbs, request_stop
+from .cell_verbs import NodeEntry, WorkcellVerbs, request_stop, stop_call
 from .channel import Answer, Call
 from .marks import verb
 from .node_verbs import NodeVerbs
@@ -300,9 +300,7 @@ class FleetVerbs(Generic[C]):
         with self._together.undisturbed() as undisturbed:
             try:
                 for cell in self.cells.values():
-                    call = Call("emergency stop", verbs.EmergencyStop("", why, False))
-                    call.enough = request_stop(cell._request, why)
-                    calls.append((cell, call))
+                    calls.append((cell, stop_call("", why, False, request_stop(cell._request, why))))
                 answers = await self._together.calls(calls, undisturbed.end)
             except BaseException:  # cancelled, as a rule: all hear of it before this ends
                 self._stop_unasked(why)
@@ -323,9 +321,8 @@ class FleetVerbs(Generic[C]):
     def _stop_unasked(self, why: str) -> None:
         """Tell all cells to stop, without waiting for their answers; a second time does no harm."""
         for cell in self.cells.values():
-            call = Call("emergency stop", verbs.EmergencyStop("", why, False))
             with suppress(OSError):
-                request_stop(cell._request, why)
+                call = stop_call("", why, False, request_stop(cell._request, why))
                 cell._channel.send(call)
                 cell._channel.abandon(call)
 

@@ -12,6 +12,10 @@ from time import monotonic, monotonic_ns, sleep
 from sioms.protocol.socketpath import cell_address
 from sioms.protocol.stopfile import StopRequest, open_stop_request
 
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from sioms.protocol.stopfile import Mark
+
 TAKEN_S = 1.0
 """How long drivers may take to obey [s]; the slowest ticks are far shorter."""
 
@@ -33,18 +37,18 @@ def emergency_stop(why: str = "", path: str | None = None, name: str | None = No
     path = path or cell_address()
     request = None if "://" in path else open_stop_request(path)
     try:
-        word = 0 if request is None else request.request(monotonic_ns(), os.getpid(), why)  # heard within a tick
+        mark = None if request is None else request.request(monotonic_ns(), os.getpid(), why)  # heard within a tick
         from .workcell import Workcell
 
-        if request is None:
+        if request is None or mark is None:
             with Workcell(path, name) as cell:
                 cell.emergency_stop(why=why)
             return ""
         try:
-            with Workcell(path, name, enough=lambda: request.taken(word)) as cell:
+            with Workcell(path, name, enough=lambda: request.taken(mark)) as cell:
                 cell.emergency_stop(why=why)  # the daemon knows who it was
         except OSError as error:
-            if error.errno == errno.EPERM or not taken(request, word):
+            if error.errno == errno.EPERM or not taken(request, mark):
                 raise
             return error.strerror or str(error)
         return ""
@@ -53,10 +57,10 @@ def emergency_stop(why: str = "", path: str | None = None, name: str | None = No
             request.close()
 
 
-def taken(request: StopRequest, word: int) -> bool:
+def taken(request: StopRequest, mark: Mark) -> bool:
     """Wait until a request has been obeyed; False when nobody has within TAKEN_S."""
     deadline = monotonic() + TAKEN_S
-    while not request.taken(word):
+    while not request.taken(mark):
         if monotonic() > deadline:
             return False
         sleep(0.002)

@@ -32,7 +32,10 @@ from sioms.protocol.page import as_of_ns
 from .parts import Followed, Held, Outside, Principal, Session
 
 KEEPALIVE = verbs.Keepalive().packed()
-READ = (verbs.Represent, verbs.Said, verbs.Supervise, verbs.Reset, verbs.Journal, verbs.Cancel, verbs.Open)
+READ = (
+    verbs.Represent, verbs.Said, verbs.Supervise, verbs.Reset, verbs.Journal, verbs.Cancel, verbs.Open,
+    verbs.EmergencyStop,
+)  # fmt: skip
 """Requests to the daemon of which the gateway reads more than that they are not these."""
 PASSED_ON = frozenset(map(int, ClientVerb)) - {int(each.verb) for each in READ}
 GATEWAYS = (verbs.Heard.verb, verbs.Passed.verb)
@@ -261,6 +264,8 @@ class Gateway:
             packet = verbs.Supervise(left_s).packed(number)
         if isinstance(message, verbs.Reset):
             self._to_line(session, verbs.Said(max(1, stamp_ns)).packed())  # 0 would say nothing
+        if isinstance(message, verbs.EmergencyStop):  # requests past the daemon are made by us, one for each stop
+            packet = verbs.EmergencyStop(message.node, message.why, message.or_all, 0).packed(number)
         if isinstance(message, verbs.Journal):
             session.asks[number] = message.device
         if isinstance(message, verbs.Cancel) and self._cancelled(session, number, message.number):

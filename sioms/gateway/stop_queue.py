@@ -7,7 +7,7 @@ from collections import deque
 from collections.abc import Iterator
 from typing import NamedTuple
 
-from .ways import Begun
+from sioms.client.cell_verbs import Asked
 
 EACH = 8
 """Stops of one certificate that wait at most; of more the first ones do the same."""
@@ -24,7 +24,7 @@ class Stop(NamedTuple):
 
     name: str
     frame: bytes
-    begun: Begun | None = None
+    begun: Asked | None = None
     came_ns: int = 0
 
 

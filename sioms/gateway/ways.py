@@ -8,11 +8,9 @@ from __future__ import annotations
 import errno
 import threading
 import time
-from collections.abc import Callable
 from contextlib import suppress
-from typing import TypeAlias
 
-from sioms.client.cell_verbs import request_stop
+from sioms.client.cell_verbs import Asked, request_stop, stop_call
 from sioms.client.channel import Call, Channel
 from sioms.client.connecting import connect
 from sioms.protocol import link, verbs
@@ -26,8 +24,6 @@ from .parts import Principal
 
 MOST_WAYS = 64
 """Sessions at the daemon that are kept for the next stop; the oldest gives way."""
-Begun: TypeAlias = Callable[[], bool]
-"""A stop that drivers have been asked for: tells whether they have taken it."""
 
 
 class Way:
@@ -49,14 +45,14 @@ class Way:
             self.close()
             raise
 
-    def begin(self, stop: verbs.EmergencyStop) -> Begun | None:
+    def begin(self, stop: verbs.EmergencyStop) -> Asked | None:
         """Have all drivers brake, if it is for the workcell and its holder may stop that. In any thread."""
         if stop.node:
             return None
         with self._begins:  # a descriptor that is closed meanwhile would be another file's
             return request_stop(self._request, printable(str(stop.why)))
 
-    def stop(self, stop: verbs.EmergencyStop, begun: Begun | None = None) -> int:
+    def stop(self, stop: verbs.EmergencyStop, begun: Asked | None = None) -> int:
         """Stop, if need be without the daemon; return the instant from which readings show it [ns].
 
         Args:
@@ -65,7 +61,7 @@ class Way:
         """
         taken = begun or self.begin(stop)
         try:
-            self._channel.call(Call("emergency stop", stop, enough=taken))
+            self._channel.call(stop_call(stop.node, stop.why, stop.or_all, taken))  # the word is ours, not the client's
         except OSError:
             if taken is None or not taken():
                 raise
@@ -92,7 +88,7 @@ class Ways:
         self._ways: dict[tuple[Principal, str], Way] = {}
         self._of: dict[Principal, Way] = {}
 
-    def begin(self, who: Principal | None, frame: bytes) -> Begun | None:
+    def begin(self, who: Principal | None, frame: bytes) -> Asked | None:
         """Have all drivers brake, if a frame stops the workcell and its sender has a session here; it is still to be
         answered. In any thread, and at once: there is nothing in it that waits.
 
@@ -109,7 +105,7 @@ class Ways:
             return None
         return way.begin(message) if isinstance(message, verbs.EmergencyStop) else None
 
-    def answer(self, who: Principal, host: str, frame: bytes, begun: Begun | None = None) -> bytes | None:
+    def answer(self, who: Principal, host: str, frame: bytes, begun: Asked | None = None) -> bytes | None:
         """Obey a frame of a client; return the frame that answers it, None for one that draws no answer.
 
         Args:
@@ -132,7 +128,7 @@ class Ways:
         return link.pack(Down.PACKET, stamp_ns=time.monotonic_ns(), body=answer)
 
     def _stop(
-        self, who: Principal, host: str, number: int, message: verbs.EmergencyStop, begun: Begun | None = None
+        self, who: Principal, host: str, number: int, message: verbs.EmergencyStop, begun: Asked | None = None
     ) -> bytes:
         for attempt in (0, 1):
             try:

@@ -6,7 +6,7 @@ if TYPE_CHECKING:
 else:
     from .enumeration import IntEnum, IntFlag
 
-PROTOCOL_VERSION = 5
+PROTOCOL_VERSION = 6
 READONLY = ".readonly"
 """What the name of a node's read-only companion ends with."""
 

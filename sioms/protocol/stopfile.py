@@ -7,9 +7,9 @@ Two files beside the daemon's socket:
   is written there clears anything.
 * ``SOCKET.stopped`` is written by drivers and daemon: which request they have taken.
 
-Drivers look at the first in every tick. Its word and the time of its last change count together: who writes the old
-word again cannot take a request back. The file is read and not mapped, because a mapped file that shrinks ends
-everybody who has mapped it.
+Drivers look at the first in every tick. Its word and the time of its last change count together, as its mark: who
+writes the old word again cannot take a request back. The file is read and not mapped, because a mapped file that
+shrinks ends everybody who has mapped it.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 REQUEST, TAKEN = ".stop", ".stopped"
 _REQUEST = Struct("<QQ240s")
-_WORD = Struct("<Q")
+_MARK = Struct("<QQ")
 SOMEBODY = "somebody, through the stop-request page"
 """The source of a request that cannot be told yet; whoever asked will tell the daemon, too."""
 _LOOKS = 20
@@ -83,23 +83,29 @@ class StopRequest:
         """The process that requested last, as far as it said."""
         return int.from_bytes(os.pread(self._fd, 8, 8), "little")
 
-    def request(self, now_ns: int, pid: int, why: str = "") -> int:
-        """Request a stop of the workcell; return the word that stands for it. Of pid 0 ``why`` says all there is."""
+    def request(self, now_ns: int, pid: int, why: str = "") -> Mark:
+        """Request a stop of the workcell; return its mark, or its word with the time of a later one. Of pid 0 ``why``
+        says all there is.
+        """
         os.pwrite(self._fd, _REQUEST.pack(now_ns, pid, why.encode()[:239]), 0)
-        return now_ns
+        return now_ns, os.fstat(self._fd).st_mtime_ns
 
     def take(self, mark: Mark) -> None:
         """Say that a request has been obeyed."""
-        os.pwrite(self._taken_fd, _WORD.pack(mark[0]), 0)
+        os.pwrite(self._taken_fd, _MARK.pack(*mark), 0)
 
     @property
-    def obeyed(self) -> int:
-        """Word of the request of which somebody has said last that he has obeyed it."""
-        return int.from_bytes(os.pread(self._taken_fd, 8, 0), "little")
+    def obeyed(self) -> Mark:
+        """Mark of the request of which somebody has said last that he has obeyed it."""
+        word, changed_ns = _MARK.unpack(os.pread(self._taken_fd, _MARK.size, 0).ljust(_MARK.size, b"\0"))
+        return word, changed_ns
 
-    def taken(self, word: int) -> bool:
-        """Tell whether a request, or a later one, has been obeyed."""
-        return self.obeyed >= word
+    def taken(self, mark: Mark) -> bool:
+        """Tell whether a request, or one that was written later, has been obeyed. Anybody can write any word: a later
+        one alone says nothing.
+        """
+        word, changed_ns = self.obeyed
+        return word >= mark[0] and changed_ns >= mark[1]
 
     def close(self) -> None:
         """Close both descriptors."""

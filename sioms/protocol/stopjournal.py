@@ -16,7 +16,7 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from .text import printable
@@ -25,11 +25,15 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any, TypeAlias
 
+    from .stopfile import Mark
+
     Part: TypeAlias = tuple[str, str, int, int]
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
 NODE, WORKCELL, CHECKPOINT, PID, ASKED = "node", "workcell", "checkpoint", "pid", "asked"
-RESETS, REQUEST = "resets", "request"
+RESETS, REQUEST, FILE = "resets", "request", "file"
+MOST_REQUESTED = 64
+"""Requests that drivers have obeyed, of which the journal knows at a time; of more it knows the last."""
 MOST_PARTS = 1 << 20
 """Channels, and bits of channels, that an entry may name, and that may be stopped in all."""
 LAST_S = 1e11
@@ -66,7 +70,7 @@ def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:
 
 
 def workcell_entry(
-    source: str, *, stop: bool, named: bool = False, resets: int = 0, request: int = 0
+    source: str, *, stop: bool, named: bool = False, resets: int = 0, requests: Sequence[Mark] = ()
 ) -> dict[str, Any]:  # fmt: skip
     """Return the entry of the stop or the reset of the workcell.
 
@@ -74,12 +78,24 @@ def workcell_entry(
         source: who did it, and why.
         stop: whether it is a stop.
         named: it says better who has stopped it.
-        resets: how many resets there had been before a stop; of a reset, with itself.
-        request: word of the stop-request file that the stop obeys; 0: it is none of the file, or counts in any case. Of
-            a reset, the last one that it answers.
+        resets: how many resets there had been before a stop by the stop-request file; of a reset, with itself.
+        requests: mark of the file that a driver obeys; of a reset, those that it answers, that of the file first.
     """
-    known = {key: value for key, value in ((RESETS, resets), (REQUEST, request)) if value}
+    known = {key: value for key, value in ((RESETS, resets), (REQUEST, [list(mark) for mark in requests])) if value}
     return {WORKCELL: "", "stop": stop, "by": source, **({"named": True} if named else {}), **known}
+
+
+def file_entry(mark: Mark) -> dict[str, Any]:
+    """Return the entry of a stop-request file that begins with a mark of which nobody has asked for anything; what has
+    been asked for by another is noted before.
+    """
+    return {WORKCELL: "", FILE: list(mark)}
+
+
+def _marks(entry: Mapping[str, Any]) -> list[Mark]:
+    """Return the marks that an entry names; before version 6 these were words alone."""
+    marks = entry.get(REQUEST, [])
+    return [(int(word), int(changed_ns)) for word, changed_ns in ([[marks, 0]] if type(marks) is int else marks)]
 
 
 def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
@@ -117,16 +133,21 @@ class Stopped:
         since_s: when that was [s since 1970].
         parts: of nodes that are stopped: who did it, and the name of the node.
         resets: how many resets of the workcell there have been.
-        request: the last word of the stop-request file that they have answered.
-        requested: of a stop that drivers have read from that file, and the daemon has not noted since, its word.
+        answered: marks of the stop-request file of which nobody asks for anything: that of the file there is first,
+            as the last reset has answered it.
+        requested: marks that drivers have obeyed and no reset is known to have answered. They say something where the
+            file is lost alone: while it is there it tells by itself what has been asked for.
+        requested_by: who has asked by the first of them, and requested_s: when that was noted [s since 1970].
     """
 
     workcell: str = ""
     since_s: float = 0.0
     parts: dict[Part, tuple[str, str]] = field(default_factory=dict)
     resets: int = 0
-    request: int = 0
-    requested: int = 0
+    answered: list[Mark] = field(default_factory=list)
+    requested: list[Mark] = field(default_factory=list)
+    requested_by: str = ""
+    requested_s: float = 0.0
 
     def apply(self, entry: Mapping[str, Any]) -> None:
         """Take an entry into account.
@@ -134,23 +155,14 @@ class Stopped:
         Raises:
             ValueError, TypeError, LookupError, ArithmeticError: it is none.
         """
+        if FILE in entry:
+            word, changed_ns = entry[FILE]
+            self.answered = [(int(word), int(changed_ns)), *self.answered][:MOST_REQUESTED]
+            self.requested = []
+            return
         stop, by = bool(entry["stop"]), printable(str(entry["by"]), 400)
         if WORKCELL in entry:
-            resets, request = int(entry.get(RESETS, 0)), int(entry.get(REQUEST, 0))
-            if not stop:
-                if self.requested <= request:
-                    self.workcell, self.since_s, self.requested = "", 0.0, 0
-                self.parts.clear()
-                self.resets, self.request = max(self.resets, resets), request
-                return
-            if resets < self.resets and 0 < request <= self.request:
-                return  # it was noted behind its own reset
-            named = bool(entry.get("named"))
-            self.requested = 0 if named else max(self.requested, request)
-            if not self.workcell or named:
-                if not 0 <= (at := float(entry["at"])) < LAST_S:
-                    raise ValueError(f"at {at} s")
-                self.workcell, self.since_s = by or "somebody", self.since_s or at
+            self._apply_to_workcell(entry, stop, by)
             return
         name, device, block = (printable(str(entry[key]), 256) for key in (NODE, "device", "block"))
         if stop and len(self.parts) > MOST_PARTS:
@@ -160,6 +172,30 @@ class Stopped:
                 self.parts.setdefault((device, block, channel, bit), (by, name))
             else:
                 self.parts.pop((device, block, channel, bit), None)
+
+    def _apply_to_workcell(self, entry: Mapping[str, Any], stop: bool, by: str) -> None:
+        resets, marks = int(entry.get(RESETS, 0)), _marks(entry)
+        if not stop:
+            self.workcell, self.since_s, self.resets, self.answered = "", 0.0, max(self.resets, resets), marks
+            self.requested = [mark for mark in self.requested if not self._has_answered(mark)]
+            self.parts.clear()
+            return
+        if not 0 <= (at := float(entry["at"])) < LAST_S:
+            raise ValueError(f"at {at} s")
+        if not marks:
+            if not self.workcell or entry.get("named"):
+                self.workcell, self.since_s = by or "somebody", self.since_s or at
+        elif marks[0] not in self.requested and (resets >= self.resets or not self._has_answered(marks[0])):
+            if not self.requested:
+                self.requested_by, self.requested_s = by or "somebody", at
+            self.requested = [*self.requested, marks[0]][-MOST_REQUESTED:]
+
+    def _has_answered(self, mark: Mark) -> bool:
+        """Tell whether what was written to the file has been answered, be it that this is noted behind its reset. Who
+        is held up between looking at the clock and writing is the last with an earlier word, and the clock of files may
+        be set: both have to be earlier.
+        """
+        return any(mark == each or (mark[0] < each[0] and mark[1] < each[1]) for each in self.answered)
 
     def take(
         self, entry: Mapping[str, Any] | None, damage: str = "a line that is not an entry", now_s: float = 0.0
@@ -199,10 +235,14 @@ class Stopped:
 
     def entries(self) -> list[dict[str, Any]]:
         """Return entries that lead from nothing to this state."""
-        entries = [workcell_entry("", stop=False, resets=self.resets, request=self.request)] if self.resets else []
+        entries = []
+        if self.resets or self.answered:
+            entries.append(workcell_entry("", stop=False, resets=self.resets, requests=self.answered))
         if self.workcell:
-            entry = workcell_entry(self.workcell, stop=True, resets=self.resets, request=self.requested)
-            entries.append({**entry, "at": self.since_s})
+            entries.append({**workcell_entry(self.workcell, stop=True), "at": self.since_s})
+        for mark in self.requested:
+            entry = workcell_entry(self.requested_by, stop=True, resets=self.resets, requests=[mark])
+            entries.append({**entry, "at": self.requested_s})
         for device in dict.fromkeys(part[0] for part in self.parts):
             for block, runs, by, name in self.of_device(device):
                 entries.append(node_entry(name, device, block, _unpacked(runs), by, stop=True))

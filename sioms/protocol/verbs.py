@@ -310,12 +310,14 @@ class EmergencyStop(
     Message, on=FROM_CLIENT, verb=ClientVerb.EMERGENCY_STOP, right=Right.STOP, shown=True
 ):  # fmt: skip
     """Stop a node, '' = the workcell, until it is reset. For the workcell, the right on any one node is sufficient.
-    `or_all`: if there is no such node, the workcell is stopped, and the request is then refused.
+    `or_all`: if there is no such node, the workcell is stopped, and the request is then refused. `word`: of the same
+    request in the stop-request file, which this process has written; 0: it has written none.
     """
 
     node: Name
     why: Text
     or_all: Flag
+    word: Integer
 
 
 class Supervise(Message, on=FROM_CLIENT, verb=ClientVerb.SUPERVISE, right=Right.STOP):

@@ -182,8 +182,7 @@ class Stops(Resets):
             if (resets, mark) == self._taken:
                 return
             if mark != answered:
-                word = mark[0] if mark[0] <= time.monotonic_ns() else 0  # anybody can write any
-                self._note(workcell_entry(self._request.source, stop=True, resets=resets, request=word))
+                self._note(workcell_entry(self._request.source, stop=True, resets=resets, requests=[mark]))
             self._request.take(mark)
             self._taken = resets, mark
 

@@ -266,7 +266,7 @@ def test_a_reset_answers_every_request_before_the_one_that_is_there(daemon: Daem
     request = open_stop_request(daemon.socket)
     assert request is not None
     with contextlib.closing(request), daemon.cell() as cell:
-        later = request.request(time.monotonic_ns(), os.getpid(), "the first that is written")
+        later, _ = request.request(time.monotonic_ns(), os.getpid(), "the first that is written")
         wait_for(lambda: cell.status()["stopped_ns"], "the first is heard")
         cell.emergency_stop(why="stopped in any case")
         first = request.request(time.monotonic_ns(), os.getpid(), "smoke")

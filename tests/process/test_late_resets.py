@@ -98,7 +98,7 @@ def test_what_one_client_sends_at_once_is_done_in_its_order(daemon: Daemon, cell
     """A stop and a reset of one session, in one go: who resets has sent the stop, and knows of it."""
     with daemon.cell("eager") as eager:
         for name in ("mod0.xaxis", ""):
-            calls = [Call("at once", each) for each in (EmergencyStop(name, "", False), Reset(name))]
+            calls = [Call("at once", each) for each in (EmergencyStop(name, "", False, 0), Reset(name))]
             with daemon.frozen(daemon.pid):
                 numbers = [eager._channel.send(call) for call in calls]
             for number, call in zip(numbers, calls, strict=True):

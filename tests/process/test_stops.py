@@ -443,7 +443,7 @@ def test_a_stop_by_a_wrong_name_that_is_interrupted_stops_all_or_has_not_been_se
 
 def test_a_client_that_dies_behind_a_stop_by_a_wrong_name_has_stopped_all(daemon: Daemon, cell: sioms.Workcell) -> None:
     with daemon.cell("doomed") as doomed, daemon.frozen(daemon.pid):
-        doomed._channel.send(Call("stop", verbs.EmergencyStop("mod0.xaxsi", "", True)))
+        doomed._channel.send(Call("stop", verbs.EmergencyStop("mod0.xaxsi", "", True, 0)))
     wait_for(lambda: cell.status()["stopped_ns"], "stopped")
     assert "of mod0.xaxsi, which there is not" in cell.status()["stop_source"]
     cell.reset()

@@ -113,7 +113,7 @@ def test_a_certificate_speaks_and_hears_only_for_itself(daemon: Daemon, gate: Ze
             )
             for key in (f"{DOWN}/{gate.number}/*", f"{DOWN}/**", "**", f"{UP}/**")
         ]
-        stop = EmergencyStop("", "not mine to say", False).packed(1)
+        stop = EmergencyStop("", "not mine to say", False, 0).packed(1)
         name = f"{gate.number}/0123456789abcdef"
         for _ in range(20):
             hostile.put(f"{UP}/{name}", link.pack(Up.HELLO, link.VERSION, 1))

@@ -23,6 +23,7 @@ from sioms.timestamps import Timestamps
 
 OWNER, STOPPER, RESETTER, LATER = 0, 1, 0, 2
 AXIS = 0
+LATE_NS = 10**9
 
 
 class Died(BaseException):
@@ -153,26 +154,34 @@ def test_a_request_that_a_reset_has_answered_stops_no_later_daemon(goes_on: bool
         assert cell.server is not None and not cell.server.cell.shared.latch.stopped_ns, place
 
 
-@pytest.mark.parametrize("dies", [False, True])
-@pytest.mark.parametrize("looks", [False, True])
-@pytest.mark.parametrize("by", ["client", "driver"])
-def test_a_stop_that_is_younger_than_a_reset_holds(by: str, looks: bool, dies: bool) -> None:
+@pytest.mark.parametrize(
+    ("dies", "looks"),
+    [*itertools.product(["nobody", "the daemon", "all"], [False, True]), ("all, and the files are lost", True)],
+)
+@pytest.mark.parametrize("by", ["client", "client that was late", "driver"])
+def test_a_stop_that_is_younger_than_a_reset_holds(by: str, looks: bool, dies: str) -> None:
+    """Also of who has looked at the clock before the request that the reset answers, and is written now."""
+
     def act(cell: Cell) -> None:
-        if by == "client":
-            cell.take(("request_stop", LATER))
+        if by != "driver":
+            cell.take(("request_stop", LATER, LATE_NS if "late" in by else 0))
         else:
             cell._process(1).runtime.stops.stop_workcell("an input")
         if looks:
             cell.take(("tick", AXIS))
 
     before: list[Action] = [("request_stop", STOPPER), ("beat",), ("tick", 1)]
-    for cell, place, answer in meetings(before, "reset", act, dies=dies):
-        if dies:
+    for cell, place, answer in meetings(before, "reset", act, dies=dies != "nobody"):
+        if dies != "nobody":
             cell.take(("crash",))
             for device in (0, 1):
-                cell.take(("hear", device))
-                assert cell._process(device).runtime.stops.stopped, (place, answer)
+                if dies == "the daemon":
+                    cell.take(("hear", device))
+                    assert cell._process(device).runtime.stops.stopped, (place, answer)
                 cell.take(("kill", device))
+            if "lost" in dies:  # as by a boot of the machine
+                for end in (stopfile.REQUEST, stopfile.TAKEN):
+                    os.unlink(cell.path + end)
             cell.take(("boot",))
         else:
             assert cell.take(("move", OWNER, AXIS)) == "refused", (place, answer)

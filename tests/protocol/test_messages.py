@@ -143,7 +143,7 @@ RECORDED: list[tuple[Message, str]] = [
     (FreeMarker(562949953421312), "930b05cf0002000000000000"),
     (SignalMarker(7), "930c0507"),
     (WaitMarker(7, 1.5), "940d0507cb3ff8000000000000"),
-    (EmergencyStop("", "why", False), "951405a0a3776879c2"),
+    (EmergencyStop("", "why", False, 0), "961405a0a3776879c200"),
     (Supervise(0.5), "931905cb3fe0000000000000"),
     (TellAlarm("mod0", "drift", 1, "why"), "961a05a46d6f6430a5647269667401a3776879"),
     (Reset("mod0"), "931505a46d6f6430"),

@@ -188,7 +188,7 @@ def test_threads_of_a_library_are_prompt_for_a_moment(monkeypatch: pytest.Monkey
 
 @pytest.mark.usefixtures("in_a_thread")
 @pytest.mark.parametrize(
-    ("message", "wanted"), [(verbs.EmergencyStop("", "why", False), True), (verbs.Reset(""), False)]
+    ("message", "wanted"), [(verbs.EmergencyStop("", "why", False, 0), True), (verbs.Reset(""), False)]
 )
 def test_a_fleet_tells_all_of_a_stop_before_who_hears_takes_its_processor(message: Any, wanted: bool) -> None:
     seen = []

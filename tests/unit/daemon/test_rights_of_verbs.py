@@ -105,8 +105,8 @@ class Workcell:
         self.cell.names, self.cell.devices = NameTable(INFOS, BITS), {"io0": self.device}  # type: ignore[dict-item]
         stops: Any = SimpleNamespace(
             hear_request=str,
-            stop_for=lambda pid, source, by: self.done.append("stop"),
-            stop_workcell=lambda source: self.done.append("stop"),
+            stop_for=lambda pid, word, source, by: self.done.append("stop"),
+            stop_workcell=lambda source, by=0: self.done.append("stop"),
             reset_workcell=lambda who, sent_ns, by: self.done.append("reset"),
             stop_node=lambda node, source, by: self.done.append(f"stop {node.name}"),
             stopped_since=lambda *_: False,
@@ -192,14 +192,14 @@ ON_NODES: dict[str, tuple[Callable[[Workcell, str], int | None], list[Right]]] =
     "open": (lambda c, node: c.open("eva", node), [Right.READ, Right.WRITE]),
     "observe": (lambda c, node: c.open("eva", f"{node}.readonly"), [Right.READ]),
     "info": (lambda c, node: c.ask("eva", ClientVerb.INFO, node), [Right.READ]),
-    "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, "", False), [Right.STOP]),
+    "stop": (lambda c, node: c.ask("eva", ClientVerb.EMERGENCY_STOP, node, "", False, 0), [Right.STOP]),
     "reset": (lambda c, node: c.ask("eva", ClientVerb.RESET, node), [EITHER]),
     "acknowledge": (lambda c, node: c.ask("eva", ClientVerb.ACKNOWLEDGE, node, ""), [EITHER]),
     "tell": (lambda c, node: c.ask("eva", ClientVerb.TELL_ALARM, node, "drift", 1, "worn"), [EITHER]),
 }
 """What is asked for on a node, and the rights that it takes: one of each entry."""
 ON_ALL: dict[str, tuple[Callable[[Workcell], int | None], Right]] = {
-    "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", "", False), Right.STOP),
+    "stop": (lambda c: c.ask("eva", ClientVerb.EMERGENCY_STOP, "", "", False, 0), Right.STOP),
     "reset": (lambda c: c.ask("eva", ClientVerb.RESET, ""), EITHER),
     "supervise": (lambda c: c.ask("eva", ClientVerb.SUPERVISE, 0.5), Right.STOP),
     "reload": (lambda c: c.ask("eva", ClientVerb.RELOAD), Right.ADMINISTER),
@@ -261,7 +261,7 @@ def test_a_stop_by_a_wrong_name_stops_all_for_who_may_and_asks_for_it(cell: Work
     for rights, or_all, wanted in ((["stop"], True, ["stop"]), (["stop"], False, []), (["read"], True, [])):
         cell.grant((rights, "eva", "io0"))
         cell.done.clear()
-        assert cell.ask("eva", ClientVerb.EMERGENCY_STOP, "io9", "it burns", or_all) == errno.ENOENT
+        assert cell.ask("eva", ClientVerb.EMERGENCY_STOP, "io9", "it burns", or_all, 0) == errno.ENOENT
         assert cell.done == wanted
         assert cell.value.endswith("; the whole workcell has been stopped instead") is bool(wanted), cell.value
 

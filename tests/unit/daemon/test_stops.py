@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -57,33 +58,56 @@ def rig() -> Iterator[Rig]:
 
 @pytest.mark.parametrize("heard_by_a_driver", [False, True])
 def test_a_request_of_the_sessions_process_is_its_stop(rig: Rig, heard_by_a_driver: bool) -> None:
-    word = rig.request.request(1000, PID, "enough")
+    mark = rig.request.request(1000, PID, "enough")
     if heard_by_a_driver:
         rig.latch.stop(1001, rig.request.source)
-    rig.stops.stop_for(PID, "eva: enough")
+    rig.stops.stop_for(PID, 1000, "eva: enough")
     assert rig.latch.stopped_ns and rig.latch.source == "eva: enough" and rig.noted == ["eva: enough"]
-    assert rig.request.taken(word) and not rig.stops.hear_request(), "it has been heard"
+    assert rig.request.taken(mark) and not rig.stops.hear_request(), "it has been heard"
     assert rig.noted == ["eva: enough"]
 
 
 def test_a_stop_that_a_driver_could_not_name_yet_is_named_by_who_asked(rig: Rig) -> None:
     rig.request.request(1000, PID, "enough")
     rig.latch.stop(1001, SOMEBODY)
-    rig.stops.stop_for(PID, "eva: enough")
+    rig.stops.stop_for(PID, 1000, "eva: enough")
     assert rig.latch.source == "eva: enough" and rig.noted == ["eva: enough"]
-    rig.stops.stop_for(PID + 1, "tom: me too")
+    rig.stops.stop_for(PID + 1, 1000, "tom: me too")
     assert rig.latch.source == "eva: enough", "and keeps that name"
 
 
 def test_a_request_of_another_process_is_another_stop(rig: Rig) -> None:
-    word = rig.request.request(1000, PID + 1, "fire")
-    rig.stops.stop_for(PID, "eva: enough")
+    """Be it that it says the word of the other, which anybody can read who sees what has been obeyed."""
+    mark = rig.request.request(1000, PID + 1, "fire")
+    rig.stops.stop_for(PID, 1000, "eva: enough")
     assert [each.split(",")[0] for each in rig.noted] == [f"pid {PID + 1}: fire", "eva: enough"]
-    assert rig.request.taken(word)
+    assert rig.request.taken(mark)
+
+
+def test_a_request_of_another_session_of_a_process_is_another_stop(rig: Rig) -> None:
+    """As of a gateway, whose sessions share it: a reset that one has sent before does not end the other's."""
+    rig.request.request(1000, PID, "enough")
+    rig.request.request(1001, PID, "fire")
+    sent_ns = time.monotonic_ns()
+    rig.stops.stop_for(PID, 1000, "eva: enough", 1)
+    assert [each.split(",")[0] for each in rig.noted] == [f"pid {PID}: fire", "eva: enough"]
+    assert rig.stops.stopped_since(sent_ns - 10**9, 1), "by somebody else than eva"
+
+
+def test_a_stop_whose_request_has_been_answered_stops_nobody_again(rig: Rig) -> None:
+    """Who stops writes a request ahead; it may be reset before what he tells the daemon is served."""
+    mark = rig.request.request(1000, PID, "enough")
+    rig.stops.hear_request()
+    rig.latch.reset(time.monotonic_ns(), mark)
+    rig.noted.clear()
+    rig.stops.stop_for(PID, 1000, "eva: enough")
+    assert not rig.latch.stopped_ns and not rig.noted
+    rig.stops.stop_for(PID, 0, "eva: enough, by a session that has written none")
+    assert rig.latch.stopped_ns
 
 
 def test_a_session_without_a_request_stops_and_a_later_request_is_heard(rig: Rig) -> None:
-    rig.stops.stop_for(PID, "eva: enough")
+    rig.stops.stop_for(PID, 0, "eva: enough")
     assert rig.noted == ["eva: enough"]
     rig.request.request(2000, PID, "again")
     assert f"pid {PID}: again" in rig.stops.hear_request()
@@ -95,7 +119,7 @@ def test_a_stop_past_the_daemon_was_asked_for_when_it_was_written(rig: Rig, is_h
     written_ns = time.monotonic_ns()
     rig.request.request(written_ns if is_honest else written_ns - 10**9, PID, "enough")
     rig.latch.stop(written_ns + 1, rig.request.source)  # by a driver
-    sent_ns = written_ns + 2
+    sent_ns = time.monotonic_ns()
     rig.stops.hear_request()
     assert rig.stops.stopped_since(written_ns - 1, 1)
     assert rig.stops.stopped_since(sent_ns, 1) is not is_honest
@@ -217,54 +241,189 @@ def test_a_stop_asked_for_by_two_at_the_same_time_is_each_ones(rig: Rig, monkeyp
         return found
 
     monkeypatch.setattr(os, "pread", pread)
-    rig.stops.stop_for(PID, "eva: enough")
+    rig.stops.stop_for(PID, 1000, "eva: enough")
     assert any("fire" in each for each in rig.noted) and rig.noted[-1] == "eva: enough"
 
 
-def files(path: Path) -> StopRequest:
-    """Leave the stop files of a daemon that has been killed."""
-    made = StopFiles(str(path))
-    return StopRequest(made.fd, made.taken_fd)
+class Daemon:
+    """The shared things of a daemon, and its stops.
+
+    Args:
+        folder: where its files are, but for its journal.
+    """
+
+    def __init__(self, folder: Path, journal: Path) -> None:
+        self.record = StopRecord(str(journal))
+        self.shared = Shared(str(folder / "sioms"), self.record)
+        self.cell = Cell(SimpleNamespace(), Log(level="error"), self.shared)  # type: ignore[arg-type]
+        self.stops = Stops(self.cell)
+        self.request = self.shared.request
+        self.drivers_journal = StopJournal(os.dup(self.record.drivers_fd))
+
+    def obey(self, mark: tuple[int, int], resets: int) -> None:
+        """Do as a driver that has found a request."""
+        entry = workcell_entry("pid 7: fire", stop=True, resets=resets, requests=[mark])
+        self.drivers_journal.append(entry, time.time())
+        self.request.take(mark)
+
+    def reset(self) -> None:
+        self.stops.hear_request()
+        self.stops.reset_workcell("ann", time.monotonic_ns(), 1)
+
+    def die(self) -> None:
+        self.record._flusher.end()
+        os.close(self.record._fd)
+        os.close(self.record.drivers_fd)
+
+    def let_go(self) -> None:
+        """Close what the daemon has open but for its journal, and the drivers' of that."""
+        shared = self.shared
+        for fd in (shared.fds[0], shared.fds[3], *shared.files.client_fds, shared.journal.fd):
+            os.close(fd)
+        self.cell.timestamps.close()
+        shared.request.close()
+        self.drivers_journal.close()
+        shared.latch.release()
+
+    @property
+    def stopped_by(self) -> str:
+        self.stops.look()
+        return self.record.state.workcell
 
 
-@pytest.mark.parametrize("obeyed", [0, 5000])
-def test_a_daemon_that_dies_at_its_start_loses_no_stop_that_nobody_has_heard(tmp_path: Path, obeyed: int) -> None:
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[[], Daemon]]:
+    made: list[Daemon] = []
+
+    def start() -> Daemon:
+        made.append(Daemon(tmp_path, tmp_path / "stops"))
+        return made[-1]
+
+    yield start
+    for daemon in made:
+        daemon.let_go()
+
+
+@pytest.mark.parametrize("obeyed", [None, (5000, 0)])
+def test_a_daemon_that_dies_at_its_start_loses_no_stop_that_nobody_has_heard(
+    start: Callable[[], Daemon], obeyed: tuple[int, int] | None
+) -> None:
     """Neither one of which a later word is said to have been obeyed, as from before the machine was started again."""
-    left = files(tmp_path / "sioms")
-    left.take((obeyed, 0))
-    left.request(1000, PID, "fire")
-    record = StopRecord(str(tmp_path / "stops"))
-    Shared(str(tmp_path / "sioms"), record)
+    first = start()
+    if obeyed:
+        first.request.take(obeyed)
+    first.request.request(1000, PID, "fire")
+    first.die()
+    start().die()
+    again = start()
+    assert "fire" in again.stopped_by
+    again.reset()
+    again.record.close()
+    assert not os.path.exists(again.record.path)
+
+
+@pytest.mark.parametrize("place", range(6))
+def test_a_daemon_that_dies_anywhere_in_its_start_is_stopped_by_nothing_that_was_reset(
+    start: Callable[[], Daemon], monkeypatch: pytest.MonkeyPatch, place: int
+) -> None:
+    first = start()
+    first.request.request(1000, PID, "fire")
+    first.reset()
+    first.die()
+    left, open_, rename, write = [place], os.open, os.rename, os.write
+
+    def mortal(call: Callable[..., Any]) -> Callable[..., Any]:
+        def called(*arguments: Any) -> Any:
+            left[0] -= 1
+            if left[0] < 0:
+                raise KeyboardInterrupt
+            return call(*arguments)
+
+        return called
+
+    record = StopRecord(first.record.path)
+    with monkeypatch.context() as patch:
+        for name, call in (("open", open_), ("rename", rename), ("write", write)):
+            patch.setattr(os, name, mortal(call))
+        with suppress(KeyboardInterrupt):
+            Shared(first.shared.files._path, record)
     record._flusher.end()
-    os.close(record._fd)  # it dies
-    again = StopRecord(str(tmp_path / "stops"))
-    assert "fire" in again.state.workcell
-    Shared(str(tmp_path / "sioms"), again)
-    again.note(workcell_entry("ann", stop=False, resets=1))
-    again.close()
-    assert not (tmp_path / "stops").exists()
+    os.close(record._fd)
+    os.close(record.drivers_fd)
+    assert not start().stopped_by
 
 
-def test_who_asks_while_the_files_are_made_is_heard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    begin = StopFiles.__init__
+def test_a_word_that_is_late_is_not_lost_with_the_daemon(start: Callable[[], Daemon]) -> None:
+    """Somebody is held up between the clock and the file; his is written in the middle of a reset, a driver obeys it
+    and knows of no reset, and the daemon dies.
+    """
+    first = start()
+    first.request.request(2000, PID, "smoke")
+    count = first.shared.latch.resets
 
-    def made(self: StopFiles, path: str) -> None:
-        begin(self, path)
-        StopRequest(os.dup(self.fd), os.dup(self.taken_fd)).request(1000, PID, "fire")
+    class Late(Latch):
+        def reset(self, *arguments: Any) -> None:
+            late.append(first.request.request(1000, PID + 1, "fire"))
+            first.obey(first.request.mark, count)
+            super().reset(*arguments)
+            raise KeyboardInterrupt
 
-    monkeypatch.setattr(StopFiles, "__init__", made)
-    record = StopRecord(str(tmp_path / "stops"))
-    shared = Shared(str(tmp_path / "sioms"), record)
-    assert shared.request.mark != shared.latch.answered_request, "what drivers look at"
-    cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
-    assert "fire" in Stops(cell).hear_request() and "fire" in record.state.workcell
-    record.close()
+    late: list[tuple[int, int]] = []
+    first.shared.latch.__class__ = Late
+    with pytest.raises(KeyboardInterrupt):
+        first.reset()
+    assert late and first.request.taken(late[0]), "who has asked for it has been told"
+    first.die()
+    again = start()
+    assert "fire" in again.stopped_by
+    again.reset()
+    assert not again.stopped_by
 
 
-def test_a_stop_that_a_driver_notes_at_the_end_of_the_daemon_is_kept(tmp_path: Path) -> None:
-    record = StopRecord(str(tmp_path / "stops"))
-    StopJournal(os.dup(record.drivers_fd)).append(workcell_entry("pid 7: fire", stop=True, request=1000), 1.0)
-    record.close()
-    again = StopRecord(str(tmp_path / "stops"))
-    assert "fire" in again.state.workcell
-    again.close()
+@pytest.mark.parametrize("answered", [False, True])
+def test_of_a_file_that_is_lost_the_journal_says_what_was_asked_for(
+    start: Callable[[], Daemon], answered: bool
+) -> None:
+    """As by a boot, while the daemon hung; and the words need not have come in their order."""
+    first = start()
+    first.reset()
+    for word in (3000, 2000):
+        time.sleep(0.01)
+        first.obey(first.request.request(word, PID, "fire"), 1)
+    if answered:
+        first.reset()
+        first.obey((1500, first.request.mark[1] - 10**6), 1)  # one that was late, and died before it looked again
+    first.die()
+    first.shared.files.remove()
+    again = start()
+    assert again.stopped_by == ("" if answered else "pid 7: fire")
+    again.reset()
+    again.die()
+    again.shared.files.remove()
+    assert not start().stopped_by
+
+
+def test_who_asks_by_the_file_of_the_daemon_before_while_the_next_one_starts_is_heard(
+    start: Callable[[], Daemon], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = start()
+    first.die()
+    show = StopFiles.show
+
+    def shown(self: StopFiles) -> None:
+        first.request.request(1000, PID, "fire")
+        show(self)
+
+    monkeypatch.setattr(StopFiles, "show", shown)
+    again = start()
+    assert "fire" in again.stopped_by
+    again.reset()
+    assert not again.stopped_by
+
+
+def test_a_stop_that_a_driver_notes_at_the_end_of_the_daemon_is_kept(start: Callable[[], Daemon]) -> None:
+    first = start()
+    first.obey((1000, time.time_ns()), 0)
+    first.shared.files.remove()
+    first.record.close()
+    assert "fire" in start().stopped_by

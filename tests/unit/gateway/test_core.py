@@ -70,6 +70,13 @@ def test_what_the_daemon_alone_reads_is_passed_on_as_it_is(world: World) -> None
     assert line.got[-len(passed) :] == passed
 
 
+def test_whose_stop_a_request_past_the_daemon_is_no_client_says(world: World) -> None:
+    """All that pass through a gateway share its process, by which the daemon knows whose a request is."""
+    line = world.begin(b"a")
+    world.frame(b"a", Up.PACKET, 0, verbs.EmergencyStop("", "enough", True, 1234).packed(3))
+    assert verbs.take(line.got[-1], verbs.FROM_CLIENT) == (3, verbs.EmergencyStop("", "enough", True, 0))
+
+
 @pytest.mark.parametrize("how", ["as clients do", "longer"])
 def test_what_the_gateway_reads_it_reads_however_it_is_packed(world: World, how: str) -> None:
     def packed(packet: bytes) -> bytes:
@@ -83,6 +90,7 @@ def test_what_the_gateway_reads_it_reads_however_it_is_packed(world: World, how:
     samples = {
         verbs.Represent: ("root", "here", []), verbs.Supervise: (1.0,), verbs.Journal: ("mod0",), verbs.Cancel: (7,),
         verbs.Open: ("mod0", 3, 0.0, 0.0), verbs.List: (), verbs.Said: (7,), verbs.Reset: ("mod0",),
+        verbs.EmergencyStop: ("", "enough", False, 7),
     }  # fmt: skip
     assert samples.keys() == {*READ, verbs.List}
     for name, fields in samples.items():  # none of them with a number that is the gateway's

@@ -61,7 +61,7 @@ def test_a_daemon_that_lets_nobody_in_is_told(ends: SimpleNamespace, monkeypatch
         way = Gone()
         if known:
             ends.stops._ways._ways[KATE, "lab2"] = way
-        answer = decode_reply(ends.stops._ways._stop(KATE, "lab2", 7, EmergencyStop("", "why", False)))
+        answer = decode_reply(ends.stops._ways._stop(KATE, "lab2", 7, EmergencyStop("", "why", False, 0)))
         assert answer[1:4] == [7, errno.EIO, "the daemon ended during the greeting"]
         assert not ends.stops._ways._ways and way.closed == known
 
@@ -71,7 +71,7 @@ def test_a_daemon_that_has_been_started_again_is_asked_again(
 ) -> None:
     ends.stops._ways._ways[KATE, "lab2"] = Gone()
     monkeypatch.setattr(ways, "Way", lambda *_: SimpleNamespace(stop=lambda *_: 5, close=lambda: None))
-    answer = decode_reply(ends.stops._ways._stop(KATE, "lab2", 7, EmergencyStop("", "why", False)))
+    answer = decode_reply(ends.stops._ways._stop(KATE, "lab2", 7, EmergencyStop("", "why", False, 0)))
     assert answer[1:3] == [7, 0]
 
 
@@ -108,11 +108,12 @@ def _frame(stop: EmergencyStop) -> bytes:
 
 
 def test_a_stop_is_begun_at_once_and_once(request_file: StopRequest) -> None:
-    found, stop = ways.Ways("/nowhere"), _frame(EmergencyStop("", "enough", False))
+    found, stop = ways.Ways("/nowhere"), _frame(EmergencyStop("", "enough", False, 0))
     before = request_file.mark
     assert found.begin(KATE, stop) is None, "nobody of hers has come in"
     assert found.answer(KATE, "lab2", link.pack(Up.HELLO)) is None
-    for none in (_frame(EmergencyStop("mod0", "", False)), b"nothing", link.pack(Up.PACKET, body=b"\xff"), stop[:-1]):
+    of_a_node = _frame(EmergencyStop("mod0", "", False, 0))
+    for none in (of_a_node, b"nothing", link.pack(Up.PACKET, body=b"\xff"), stop[:-1]):
         assert found.begin(KATE, none) is None
     assert found.begin(None, stop) is None and found.begin(Principal("ben"), stop) is None
     assert request_file.mark == before, "none of these stops anything"

@@ -105,10 +105,22 @@ def test_a_request_that_is_just_being_written_is_not_told_for_that_of_the_one_be
 
 
 def test_a_request_is_taken(request_file: StopRequest) -> None:
-    word = request_file.request(1000, 42)
-    assert not request_file.taken(word)
+    word, changed_ns = mark = request_file.request(1000, 42)
+    assert mark == request_file.mark and not request_file.taken(mark)
     request_file.take(request_file.mark)
-    assert request_file.taken(word) and request_file.taken(word - 1) and not request_file.taken(word + 1)
+    assert request_file.taken(mark) and request_file.taken((word - 1, changed_ns))
+    assert not request_file.taken((word + 1, changed_ns))
+
+
+def test_a_word_of_the_future_takes_no_later_request(request_file: StopRequest) -> None:
+    """Anybody can write any word; who asks behind it waits for somebody to obey."""
+    request_file.request((1 << 64) - 1, 42)
+    request_file.take(request_file.mark)
+    time.sleep(0.02)  # the clock of the file system ticks
+    mark = request_file.request(1000, 43)
+    assert not request_file.taken(mark)
+    request_file.take(request_file.mark)
+    assert request_file.taken(mark)
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from sioms.protocol.stopjournal import (
     StopJournal,
     Stopped,
     channels_and_bits,
+    file_entry,
     node_entry,
     parts_of,
     replay,
@@ -72,40 +73,62 @@ def test_what_is_noted_is_there_after_a_death_without_an_end(path: str) -> None:
     assert not os.path.exists(path)
 
 
-def test_a_stop_that_is_noted_behind_its_own_reset_is_over(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_that_is_noted_behind_its_own_reset_is_over(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver notes a stop when it has done it; others may have seen it, and its reset, before."""
     monkeypatch.setattr(stop_record, "MOST_BYTES", 1)  # a checkpoint after every entry
     record = StopRecord(path)
     for word in range(5, 9):
         resets = record.state.resets
-        record.note(workcell_entry("ann", stop=True, named=True, resets=resets))
-        record.note(workcell_entry("ann", stop=False, resets=resets + 1, request=word))
+        record.note(workcell_entry("ann", stop=False, resets=resets + 1, requests=[(word, word)]))
         for request in range(5, word + 1):
-            record.note(workcell_entry("pid 7", stop=True, resets=resets, request=request))
-        assert not record.state.workcell and not kept(path).workcell
-    for resets, request in ((4, 8), (4, 5), (3, 9), (3, 0), (0, 0)):
-        record.note(workcell_entry("bob", stop=True, resets=resets, request=request))
-        assert record.state.workcell == kept(path).workcell == "bob", "no other stop is taken for it"
-        record.note(workcell_entry("ann", stop=False, resets=4, request=max(request, 8)))
+            record.note(workcell_entry("pid 7", stop=True, resets=resets, requests=[(request, request)]))
+        assert not record.state.requested and not kept(path).requested
+    for resets, mark in ((4, (8, 8)), (4, (5, 5)), (3, (9, 9)), (3, (7, 8)), (3, (8, 7)), (3, (7, 9)), (3, (9, 7))):
+        record.note(workcell_entry("bob", stop=True, resets=resets, requests=[mark]))
+        for state in (record.state, kept(path)):
+            assert state.requested == [mark] and state.requested_by == "bob", "no other request is taken for it"
+        record.note(workcell_entry("ann", stop=False, resets=4, requests=[(8, 8), mark]))
+        assert not record.state.requested and not kept(path).requested
+        record.note(workcell_entry("ann", stop=False, resets=4, requests=[(8, 8)]))
 
 
-def test_a_reset_ends_no_stop_that_it_has_not_answered(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_reset_ends_no_request_that_it_has_not_answered(path: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """A driver notes a request that the daemon has not heard when it resets, and may not live to tell."""
     record = StopRecord(path)
-    record.note(workcell_entry("pid 7", stop=True, request=9))
-    record.note(workcell_entry("ann", stop=False, resets=1, request=8))
-    assert record.state.workcell == kept(path).workcell == "pid 7"
+    record.note(workcell_entry("pid 7", stop=True, requests=[(9, 9)]))
+    record.note(workcell_entry("ann", stop=False, resets=1, requests=[(8, 8)]))
+    assert record.state.requested == kept(path).requested == [(9, 9)]
     monkeypatch.setattr(stop_record, "MOST_BYTES", 1)  # a checkpoint
-    record.note(workcell_entry("ann", stop=False, resets=2, request=8))
-    assert record.state.workcell == kept(path).workcell == "pid 7"
-    record.note(workcell_entry("ann", stop=False, resets=3, request=9))
-    assert not record.state.workcell and not kept(path).workcell
-    record.note(workcell_entry("pid 7", stop=True, resets=3, request=20))
+    record.note(workcell_entry("ann", stop=False, resets=2, requests=[(8, 8)]))
+    assert record.state.requested == kept(path).requested == [(9, 9)]
     record.close()
     record = StopRecord(path)
-    assert record.state.workcell == "pid 7"
-    record.note(workcell_entry("ann", stop=False, resets=4))
-    assert not record.state.workcell and not kept(path).workcell, "the words of another daemon's file say nothing"
+    assert record.state.requested_by == "pid 7"
+    record.note(workcell_entry("ann", stop=False, resets=3, requests=[(9, 9)]))
+    assert not record.state.requested and not kept(path).requested
+    record.note(workcell_entry("pid 7", stop=True, resets=3, requests=[(20, 20)]))
+    record.note(file_entry((0, 30)))
+    assert not record.state.requested and not kept(path).requested, "what a lost file has asked for is noted before"
+    assert kept(path).answered[:2] == [(0, 30), (9, 9)]
+
+
+def test_words_of_before_version_6_are_read(path: str) -> None:
+    record = StopRecord(path)
+    record.note({**workcell_entry("ann", stop=False, resets=1), "request": 8})
+    record.note({**workcell_entry("pid 7", stop=True), "request": 8})
+    assert not record.state.requested
+    record.note({**workcell_entry("pid 7", stop=True, resets=1), "request": 9})
+    assert kept(path).requested_by == "pid 7"
+
+
+def test_many_requests_take_a_bounded_room(path: str) -> None:
+    record = StopRecord(path)
+    for word in range(3 * stopjournal.MOST_REQUESTED):
+        for _ in range(2):
+            record.note(workcell_entry("pid 7", stop=True, requests=[(word, word)]))
+    assert len(record.state.requested) == stopjournal.MOST_REQUESTED
+    record.note(workcell_entry("ann", stop=False, resets=1, requests=record.state.requested))
+    assert not record.state.requested and not kept(path).requested
 
 
 def test_a_bit_is_stopped_and_reset_by_itself(path: str) -> None:
