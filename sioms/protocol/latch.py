@@ -130,6 +130,7 @@ class Latch:
         if self._words[_STOPPED]:
             self._separate[_ENDED_AT] = now_ns
             self._words[_ENDED] = self._words[_STOPPED]
+            fence()  # who does not find the stop any more finds that it was there
         if request is not None:
             self._words[_ANSWERED_AT] = request[1]
             self._words[_ANSWERED] = request[0]  # last: half of it is older than the request

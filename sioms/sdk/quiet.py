@@ -61,7 +61,7 @@ class QuietRun:
         self._ready = np.zeros(MOST_EVENTS, dtype=np.int64)
         self.record = Quiet(
             poll=poll, timer=timer, line_timer=line_timer, ready=self._ready, latch=latch, is_stopped=0, stopped=0,
-            resets=0, orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1,
+            resets=0, ended=0, orders=0, daemon_lease_ns=daemon_lease_ns, until_ns=0, period_ns=period_ns, periods=1,
             lead_ns=lead_ns, announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0,
             device=steps.record,
             tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, desk=desk.record,
@@ -92,7 +92,7 @@ class QuietRun:
             return False
         self.desk.lend()
         record.until_ns = min(until_ns, self._clients.until_ns())
-        record.stopped, record.resets, record.orders = self._stops.seen
+        record.stopped, record.resets, record.ended, record.orders = self._stops.seen
         record.is_stopped = self._stops.stopped
         record.scheduled_ns, record.number = scheduled_ns, number
         record.watched, record.periods, record.restless_ns = watched, idling.periods, idling.restless_ns

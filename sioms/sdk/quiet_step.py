@@ -1,8 +1,7 @@
 """Ticks in which nothing happens but motion: from one wait of the process to the next event that is more than that.
 
-Plain writes of clients are served, too (serve_step.py); the tick that carries them out is the loop's.
-
-``run`` waits as the loop does. What is due is done here as long as the timer is all that is ready, nobody has asked for
+Plain writes of clients are served, too (serve_step.py); the tick that carries them out is the loop's. ``run`` waits as
+the loop does. What is due is done here as long as the timer is all that is ready, nobody has asked for
 a stop, no lease runs out, and the driver's own step has nothing to tell. Everything else is the loop's (runtime.py),
 which finds a state as if it had done the ticks itself.
 """
@@ -34,6 +33,7 @@ DAEMON_ALIVE: Final = 2
 ANSWERED: Final = 3
 ANSWERED_AT: Final = 4
 ORDERS: Final = 5
+ENDED: Final = 7
 """Words of the latch page."""
 HEAD: Final = 9
 ALIVE: Final = 10
@@ -52,8 +52,7 @@ MOST_SUBSCRIBERS: Final = 32
 DONE: Final = 0
 LEFT: Final = 1
 HEARD: Final = 2
-"""What has become of a descriptor that was ready: all is done; it is the loop's; all is done, and the loop has to hear
-of it."""
+"""Of a descriptor that was ready: all is done; it is the loop's; all is done, and the loop has to hear of it."""
 HALTS: Final = 1
 STOPS: Final = 2
 """How axes brake: as those whose owner has gone, or latched."""
@@ -119,6 +118,7 @@ class Quiet(Record):
     is_stopped: int
     stopped: int
     resets: int
+    ended: int
     orders: int
     daemon_lease_ns: int
     until_ns: int
@@ -304,9 +304,16 @@ def is_called(q: Quiet) -> int:
 
 
 @step
+def has_missed(q: Quiet) -> int:
+    """Return whether a stop has come and gone since the last look, its reset maybe not being there in whole."""
+    return not q.is_stopped and q.latch[ENDED] != q.ended
+
+
+@step
 def is_asked(q: Quiet) -> int:
     """Return whether something has been asked for that comes before the writes of clients."""
-    return q.heeded_ns or q.latch[STOPPED] or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders
+    is_said = q.latch[STOPPED] or q.latch[RESETS] != q.resets or q.latch[ORDERS] != q.orders
+    return q.heeded_ns or is_said or has_missed(q)
 
 
 @step
@@ -334,7 +341,7 @@ def may_tick(q: Quiet, now_ns: int) -> int:
         if not q.patient or not q.is_stopped:
             return 0
         owe(q)
-    elif q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns):
+    elif (q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns)) or has_missed(q):
         return 0
     if q.latch[ORDERS] != q.orders and not q.heeded_ns and is_called(q):
         if not q.patient:

@@ -309,8 +309,8 @@ class Resets:
             if handle.block is block and not reset.isdisjoint(handle.axes) and handle.number != by:
                 handle.note_reset(at_ns)
 
-    def _note_workcell_reset(self) -> bool:
-        """Note that the workcell has been reset; return whether that has ended a stop that was not seen."""
+    def _note_workcell_reset(self) -> None:
+        """Note that the workcell has been reset."""
         latch, before_ns = self._latch, self._ended_ns
         self._ended_ns = ended_ns = latch.ended_stop_ns
         if ended_ns != before_ns:
@@ -320,7 +320,6 @@ class Resets:
         else:  # the workcell was not stopped: of what its nodes are
             for block in self._blocks:
                 self._note_reset(block, self._stopped_of(block, range(block.n), -1), latch.reset_ns)
-        return ended_ns != before_ns and not self.stopped
 
     def _clear(self, block: AnyBlock, parts: Iterable[tuple[int, int]]) -> None:
         """Clear the stop and the faults of parts of a block."""

@@ -113,15 +113,25 @@ class Stops(Resets):
     @property
     def is_up_to_date(self) -> bool:
         """Whether all that latch, request page and daemon ask for has been seen."""
-        latch = self._latch
-        return (
-            latch.stopped_ns, latch.resets, self._request.mark
-        ) == self._seen and latch.orders == self._orders  # fmt: skip
+        return not self._is_news and self._latch.orders == self._orders
 
     @property
-    def seen(self) -> tuple[int, int, int]:
-        """What has been seen: the time of the latch's stop [ns], how often it was reset, orders of the daemon."""
-        return (*self._seen[:2], self._orders)
+    def _is_news(self) -> bool:
+        """Whether latch or request file say something else than at the last look."""
+        latch = self._latch
+        return (latch.stopped_ns, latch.resets, self._request.mark) != self._seen or self._has_missed
+
+    @property
+    def _has_missed(self) -> bool:
+        """Whether a stop has come and gone since the last look, its reset maybe not being there in whole."""
+        return not self.stopped and self._latch.ended_stop_ns != self._ended_ns
+
+    @property
+    def seen(self) -> tuple[int, int, int, int]:
+        """What has been seen: the time of the latch's stop [ns], how often it was reset, the last stop that a reset has
+        ended, orders of the daemon.
+        """
+        return (*self._seen[:2], self._ended_ns, self._orders)
 
     @property
     def seen_request(self) -> Mark:
@@ -138,8 +148,7 @@ class Stops(Resets):
 
     def heed(self) -> None:
         """Look whether the emergency stop, or its reset, has come since the last look; cheap."""
-        latch = self._latch
-        if (latch.stopped_ns, latch.resets, self._request.mark) != self._seen:
+        if self._is_news:
             self.look()
 
     def look(self) -> None:
@@ -155,7 +164,9 @@ class Stops(Resets):
             self._seen = stopped_ns, _, mark = latch.stopped_ns, resets, self._request.mark
             is_asked = mark != latch.answered_request
         is_stopped, is_reset = stopped_ns != 0 or is_asked, resets != seen_resets
-        is_missed = is_reset and self._note_workcell_reset()
+        is_missed = self._has_missed
+        if is_reset:
+            self._note_workcell_reset()
         if (is_stopped and (is_reset or not self.stopped)) or is_missed:
             self._stop_here(self.source)
         if is_asked or mark != seen_mark:

@@ -189,3 +189,16 @@ def test_a_stop_that_is_younger_than_a_reset_holds(by: str, looks: bool, dies: s
         assert cell.server is not None and cell.record is not None
         assert cell.server.cell.shared.latch.stopped_ns, (place, answer)
         assert cell.record.state.workcell, (place, answer)
+
+
+def test_who_has_missed_a_stop_stops_also_where_its_reset_is_half_done() -> None:
+    """The daemon may be held up in the middle of it; and the stop has been acknowledged."""
+    seen: list[bool] = []
+
+    def act(cell: Cell) -> None:
+        cell.take(("hear", AXIS))
+        seen.append(cell._process(AXIS).runtime.driver.moves())  # type: ignore[attr-defined]
+
+    for _, place, answer in meetings([("move", OWNER, AXIS), ("stop", STOPPER)], "reset", act):
+        assert answer == "done" and not seen[-1], place
+    assert len(seen) > 10

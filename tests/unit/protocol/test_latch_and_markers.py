@@ -38,13 +38,15 @@ def test_no_processor_shows_the_count_of_a_reset_before_what_it_says(monkeypatch
     at_fences: list[tuple[object, ...]] = []
 
     def fence() -> None:
-        at_fences.append((made.stopped_ns, made.answered_request, made.reset_ns, made._words[1]))
+        at_fences.append((made.stopped_ns, made.ended_stop_ns, made.answered_request, made.reset_ns, made._words[1]))
 
     monkeypatch.setattr(latch, "fence", fence)
     made.stop(3, "fire")
     made.reset(5, (7, 8))
-    assert at_fences == [(0, (7, 8), 5, 0)], "all but the count"
-    assert made.resets == 1 and len(at_fences) == 2, "and who has read that looks at the rest behind it"
+    ended, counted = at_fences
+    assert ended[:2] == (3, 3), "that there was a stop is there before it is gone"
+    assert counted == (0, 3, (7, 8), 5, 0), "all but the count"
+    assert made.resets == 1 and len(at_fences) == 3, "and who has read that looks at the rest behind it"
 
 
 def test_a_stop_and_reset_between_two_looks_shows() -> None:

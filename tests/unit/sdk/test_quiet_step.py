@@ -22,6 +22,7 @@ from sioms.sdk.quiet import QuietRun
 from sioms.sdk.quiet_step import (
     DAEMON_ALIVE,
     DONE,
+    ENDED,
     HALTS,
     HEARD,
     LEFT,
@@ -68,11 +69,12 @@ class Device:
         self.ready, self.ring = np.zeros(64, dtype=np.int64), np.zeros(7 * RING, dtype=np.int64)
         given = {
             "poll": self.poll.fileno(), "timer": self.timer, "line_timer": self.line.fd, "ready": self.ready,
-            "latch": self.latch, "is_stopped": 0, "stopped": 0, "resets": 0, "orders": 0, "daemon_lease_ns": LEASE_NS,
-            "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns, "announced": 0,
-            "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0, "device": Page.empty(),
-            "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0, "number": 7, "waiting": 0,
-            "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0, "braked_ns": 0, "patient": 0,
+            "latch": self.latch, "is_stopped": 0, "stopped": 0, "resets": 0, "ended": 0, "orders": 0,
+            "daemon_lease_ns": LEASE_NS, "until_ns": 2**62, "period_ns": PERIOD_NS, "periods": 1, "lead_ns": lead_ns,
+            "announced": 0, "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0,
+            "device": Page.empty(), "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0,
+            "number": 7, "waiting": 0, "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0,
+            "braked_ns": 0, "patient": 0,
             "called": 0, "control": self.control, "desk": Desk.empty(), "request": StopFile.empty(),
             "spare": np.zeros(64, dtype=np.int64), "done": 0, "expired": 1, "slackens": 0,
             "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
@@ -125,7 +127,7 @@ def make():
         device.close()
 
 
-@pytest.mark.parametrize("word", [STOPPED, RESETS, ORDERS])
+@pytest.mark.parametrize("word", [STOPPED, RESETS, ENDED, ORDERS])
 def test_what_is_said_in_the_latch_is_the_loops(make, word):
     device = make()
     device.latch[word] += 1
@@ -549,7 +551,8 @@ def test_steps_last_no_longer_than_waits_and_the_leases_of_clients(waits_ns, cli
     quiet = quiet_run(waits_ns, clients_ns)
     assert quiet.lend(1_000, 4, True)
     assert quiet.record.until_ns == until_ns
-    assert (quiet.record.is_stopped, quiet.record.stopped, quiet.record.resets, quiet.record.orders) == (1, 3, 2, 1)
+    record = quiet.record
+    assert (record.is_stopped, record.stopped, record.resets, record.ended, record.orders) == (1, 3, 2, 4, 1)
 
 
 @pytest.mark.parametrize("why", ["a wait needs the loop", "the driver is not ready", "its pages cannot be lent"])
@@ -570,7 +573,7 @@ def quiet_run(waits_ns, clients_ns, is_ready=True, lends=True):
     quiet = QuietRun(
         steps, record.poll.fileno(), record.timer, record.line.fd, record.control, record.latch, PERIOD_NS, 0, LEASE_NS,
         SimpleNamespace(rest_ns=1, periods=1, restless_ns=0), np.zeros(2, dtype=np.int64),
-        SimpleNamespace(lend=lambda: lends), SimpleNamespace(stopped=True, seen=(3, 2, 1)),
+        SimpleNamespace(lend=lambda: lends), SimpleNamespace(stopped=True, seen=(3, 2, 4, 1)),
         SimpleNamespace(until_ns=lambda: waits_ns, any=waits_ns < 2**62), SimpleNamespace(until_ns=lambda: clients_ns),
         statistics, SimpleNamespace(record=Desk.empty(), request=StopFile.empty(), lend=lambda: None),
     )  # fmt: skip
