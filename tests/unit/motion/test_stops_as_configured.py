@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import Phase, assume, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 
 from sioms.motion import AxisKind, CommandError, EventKind, Homing
@@ -488,6 +488,8 @@ def test_limits_that_are_set_of_a_stopped_axis_leave_what_holds_it() -> None:
     most=st.floats(0.05, 10.0), mass=st.floats(0.5, 3.0), viscous=st.floats(0, 8), pull=st.floats(-2, 2),
     before=st.integers(1, 250), also_force=st.booleans(), emergency=st.booleans(),
 )  # fmt: skip
+@example(k=3983.0, kb=-27.4, kz=-1.568, kp=-0.744, most=2.55, mass=0.562, viscous=2.02, pull=-1.335, before=203,
+         also_force=True, emergency=True)  # fmt: skip
 def test_an_axis_stands_soon_whatever_a_command_has_set(
     k: float, kb: float, kz: float, kp: float, most: float, mass: float, viscous: float, pull: float,
     before: int, also_force: bool, emergency: bool,
@@ -500,16 +502,22 @@ def test_an_axis_stands_soon_whatever_a_command_has_set(
     mode = VELOCITY | GAINS | (MAX_FORCE if also_force else 0)
     rig.write(mode=mode, velocity=0.3, k=k, kb=kb, kz=kz, kp=kp, max_force=most, replace=True)
     rig.tick(before)
-    assume(not int(rig.field("status")) & AxisStatus.FAULT)  # by those gains: its motor is off
-    place, speed = plant.position, abs(plant.velocity)
+    place, speed, ticks = plant.position, abs(plant.velocity), len(rig.history)
+    is_in_fault = int(rig.field("status")) & AxisStatus.FAULT != 0  # by those gains
+    is_let_go = is_in_fault and "though" not in rig.bank.fault_text(0)  # that its loop is not to blame is not known
     (rig.bank.emergency_stop if emergency else rig.bank.stop)(rig.axes, rig.now_ns)
-    rig.tick(3000)
+    rig.tick(300 if is_let_go else 3000)
+    assert bool(int(rig.field("status")) & AxisStatus.EMERGENCY_STOP) == emergency
+    assert bool(int(rig.field("status")) & AxisStatus.FAULT) == is_in_fault
+    if is_let_go:
+        assert not rig.trace("force")[ticks:].any(), "no stop puts a loop in force that is in doubt"
+        assert abs(plant.velocity) < 2e-2 or int(rig.field("status")) & AxisStatus.MOVING, "it tells that it moves"
+        return
     assert abs(plant.velocity) < 2e-3
     weakest = (10.0 - abs(pull)) / mass  # the motor's deceleration against what pulls
     carried = 10.0 / 400  # what keeps the output as it was, which need not be a load
     way = speed**2 / (2 * min(2.0, weakest)) + 0.1 * speed + carried + 0.01
     assert abs(plant.position - place) <= 2 * way
-    assert bool(int(rig.field("status")) & AxisStatus.EMERGENCY_STOP) == emergency
 
 
 def test_a_command_that_waits_for_a_brake_begins_where_the_brake_yields() -> None:
