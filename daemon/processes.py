@@ -105,6 +105,8 @@ class Processes:
                 self._markers.signalled()
             case driver_verbs.Stopped(source):
                 self._stops.stop_workcell(source)
+            case driver_verbs.StopsShown(at_ns):
+                self._cell.shared.record.shown(at_ns, device.name)
             case driver_verbs.LinkChanged(number, reason):
                 state = PageState(number)
                 good = state in (PageState.GOOD, PageState.STARTING)

@@ -14,13 +14,17 @@ import os
 import stat
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from sioms.part_times import PartTimes
 from sioms.protocol.stopjournal import CHECKPOINT, PID, StopJournal, Stopped, asked_ns, entries_from, replay
 
 from .realtime import end_promptly
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from sioms.protocol.stopjournal import Part
 
 MOST_BYTES = 1 << 18
 """From so many bytes after the last checkpoint on, there is a new one, and what lies before it is freed."""
@@ -42,7 +46,7 @@ class StopRecord:
         state: what is stopped, after the last ``look``.
         drivers_fd: descriptor for drivers, to append to.
         by_drivers: entries of drivers that have been read, the oldest first; who has seen to them takes them out.
-        asked: when stops have been asked for since this daemon began.
+        asked: when stops have been asked for since this daemon began; of one by an alarm, when it could be known.
     """
 
     def __init__(self, path: str) -> None:
@@ -65,6 +69,7 @@ class StopRecord:
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
         self.by_drivers: list[Mapping[str, Any]] = []
         self.asked = PartTimes()
+        self._unshown: list[tuple[Part, int]] = []
         self._at = size
         self._checked_at = start
         self._flusher = _Flusher(self._fd)
@@ -95,11 +100,35 @@ class StopRecord:
             self.state.take(entry, now_s=time.time())
             if entry and PID in entry:
                 self.by_drivers.append(entry)
-                for device, block, channel, bit in self.state.still(entry):
-                    self.asked.note((device, block), [(channel, bit)], asked_ns(entry, time.monotonic_ns()))
+                at_ns, now_ns = asked_ns(entry), time.monotonic_ns()
+                for part in self.state.still(entry):
+                    if at_ns > now_ns:
+                        self._unshown.append((part, at_ns))
+                    else:
+                        self.asked.note(part[:2], [part[2:]], at_ns)
         if read:
             self._flusher.flush()
         return True
+
+    def shown(self, at_ns: int, device: str = "") -> None:
+        """Take into account since when the stops of a device ('': of any) that have been noted can be known of."""
+        self.look()
+        self._settle(lambda part, latest_ns: min(at_ns, latest_ns) if device in ("", part[0]) else 0)
+
+    def unshown(self) -> list[Part]:
+        """Return what is stopped by alarms since so short a time that nobody can know of it."""
+        now_ns = time.monotonic_ns()
+        self._settle(lambda _, latest_ns: latest_ns if latest_ns <= now_ns else 0)
+        return [part for part, _ in self._unshown]
+
+    def _settle(self, since_ns: Callable[[Part, int], int]) -> None:
+        """Note for parts that can be known of by now since when, which is told of each; 0: not yet."""
+        unshown, self._unshown = self._unshown, []
+        for part, latest_ns in unshown:
+            if at_ns := since_ns(part, latest_ns):
+                self.asked.note(part[:2], [part[2:]], at_ns)
+            else:
+                self._unshown.append((part, latest_ns))
 
     def note(self, entry: Mapping[str, Any]) -> None:
         """Note a stop or a reset.

@@ -163,12 +163,16 @@ class Stops:
         """
         record = self._shared.record
         record.look()
-        asked = record.asked
-        latest_ns = asked.latest_of_any_ns(by) if node is None else asked.latest_ns(*_masks(*self._parts(node)), by)
-        return latest_ns > instant_ns
+        asked, unshown = record.asked, record.unshown()
+        if node is None:
+            return bool(unshown) or asked.latest_of_any_ns(by) > instant_ns
+        block, parts = self._parts(node)
+        mine = {(*block, *part) for part in parts}
+        return not mine.isdisjoint(unshown) or asked.latest_ns(*_masks(block, parts), by) > instant_ns
 
     def stopped_by(self, node: Node | None = None) -> str:
-        """Return who has stopped a node, or the workcell or any of its nodes, in words."""
+        """Return who has stopped a node, or the workcell or any of its nodes, in words that somebody is told."""
+        self._shared.record.shown(time.monotonic_ns())
         if node is None:
             nodes = [f"{name}: {by}" for name, by in self._shared.record.state.nodes()]
             return self._shared.latch.source if self._shared.latch.stopped_ns else ", ".join(nodes[-2:])
@@ -249,7 +253,7 @@ class Stops:
                 if number >= 0 and channel < len(channels := device.info.blocks[number].channels):
                     channels_of.setdefault((number, bit if channels[channel].width else -1), []).append(channel)
             for (number, bit), stopped in channels_of.items():
-                resets, at_ns = self._shared.latch.resets, asked_ns(entry, time.monotonic_ns())
+                resets, at_ns = self._shared.latch.resets, min(asked_ns(entry), time.monotonic_ns())
                 device.tell(driver_verbs.NodeStop(number, stopped, bit, str(entry["by"]), resets, at_ns))
                 self._shared.latch.ordered()
             self._cell.log("warning", "emergency stop", node=entry[NODE], source=entry["by"], heard_by=entry[PID])

@@ -89,8 +89,8 @@ class WorkcellVerbs:
     def status(self) -> dict[str, object]:
         """Return what `sioms status` shows."""
         cell = self._cell
-        cell.shared.record.look()
         now = time.monotonic_ns()
+        cell.shared.record.shown(now)
         latch = cell.shared.latch
         return {
             "workcell": self._cell.bounds.name,

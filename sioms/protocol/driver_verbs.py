@@ -33,6 +33,7 @@ class DriverVerb(IntEnum):
     LOG = 25
     ALARM = 26
     HELD_SILENT = 27
+    STOPS_SHOWN = 28
 
 
 class ForkServerVerb(IntEnum):
@@ -164,6 +165,14 @@ class Stopped(Message, on=FROM_DRIVER, verb=DriverVerb.STOPPED, notice=True):
     """The driver stops the workcell, and could not write the stop-request file."""
 
     source: Text
+
+
+class StopsShown(Message, on=FROM_DRIVER, verb=DriverVerb.STOPS_SHOWN, notice=True):
+    """Since when somebody may know of the stops by alarms that the driver has noted: told before anybody does. A reset
+    that was sent earlier leaves them.
+    """
+
+    at_ns: Integer
 
 
 class LinkChanged(Message, on=FROM_DRIVER, verb=DriverVerb.LINK, notice=True):

@@ -58,10 +58,12 @@ def node_entry(
     }  # fmt: skip
 
 
-def asked_ns(entry: Mapping[str, Any], now_ns: int) -> int:
-    """Return when the stop of an entry was asked for, now at the latest [ns, CLOCK_MONOTONIC]; 0: unknown."""
+def asked_ns(entry: Mapping[str, Any]) -> int:
+    """Return when the stop of an entry was asked for; of one by an alarm, when it can be known of at the latest [ns,
+    CLOCK_MONOTONIC]; 0: unknown.
+    """
     at_ns = entry.get(ASKED, 0)
-    return min(at_ns, now_ns) if type(at_ns) is int else 0
+    return at_ns if type(at_ns) is int else 0
 
 
 def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:

@@ -254,7 +254,7 @@ class Attachments:
         # Nothing is taken after a stop, or refused after its reset, because no tick has come in between; and no order
         # that was acknowledged before undoes what is acknowledged now.
         self._service.loop.heed()
-        self._service.stops.note_faults()  # before an answer may tell of one
+        self._service.stops.before_telling()  # before an answer may tell of one
         if handle.number not in self.handles:
             return  # that was the order
         try:

@@ -256,10 +256,12 @@ class Waits:
 
     Attributes:
         a_look: how many of each user are looked at after a publication.
+        before: called before any are told that they have ended.
     """
 
     def __init__(self, effects: Effects, journal: JournalWriter, log: Callable[[str, str], None]) -> None:
         self.a_look = LOOKS_A_MS
+        self.before: Callable[[], None] = lambda: None
         self._log = log
         self._effects = effects
         self._journal = journal
@@ -368,6 +370,8 @@ class Waits:
         for waiting in list(self._of.values()):
             mine = [wait for wait in waiting if wait.refusal is None and condition(wait)]
             ended += mine
+            if mine:
+                self.before()
             for wait in mine[: self.a_look]:
                 self._refuse(wait, errno_, f"{wait.what}: {text}")
             for wait in mine[self.a_look :]:

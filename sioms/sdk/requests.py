@@ -10,6 +10,7 @@ import errno
 import math
 import traceback
 from collections.abc import Generator, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -62,9 +63,9 @@ def ioctl(
     match request:
         case Request.EMERGENCY_STOP:
             source = f"{handle.who} on {handle.node}"
-            service.stops.stop_node(handle.block, handle.channels, handle.bit, source, by=handle.number)
-            handle.begins_anew(handle.axes)
-            return service.stops.note_node(handle, source, stop=True)
+            note = partial(service.stops.note_node, handle, source, stop=True)  # before others are told
+            service.stops.stop_node(handle.block, handle.channels, handle.bit, source, by=handle.number, note=note)
+            return handle.begins_anew(handle.axes)
         case Request.RESET:
             if argument is not None and (type(argument) is not int or argument < 0):
                 raise _refuse(errno.EINVAL, f"{what}: {shown(argument)} as instant; want a time in ns, or none for now")

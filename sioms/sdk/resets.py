@@ -15,7 +15,7 @@ import numpy as np
 
 from sioms.motion import CommandError
 from sioms.part_times import PartTimes
-from sioms.protocol.driver_verbs import AlarmChanged
+from sioms.protocol.driver_verbs import AlarmChanged, StopsShown
 from sioms.protocol.flags import Severity
 from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.latch import Latch
@@ -67,8 +67,8 @@ class Resets:
         self.latched_outputs: dict[tuple[int, int, int], str] = {}
         self._faulty: set[tuple[int, int]] = set()
         self._unshown: list[tuple[AnyBlock, list[tuple[int, int]], int]] = []
-        """What alarms have stopped since the last publication: for who resets it, that counts from when it is shown, or
-        from when the daemon has been told that it is [ns, CLOCK_MONOTONIC]."""
+        """What alarms have stopped since the last publication: for who resets it, that counts from when it is shown, at
+        the latest from a time when the daemon lists it [ns, CLOCK_MONOTONIC]."""
         self._device, self._blocks = device, blocks
         self._axes = [block for block in blocks if isinstance(block, AxisBlock)]
         self._effects, self._handles, self._log, self._tell = effects, handles, log, tell
@@ -116,14 +116,20 @@ class Resets:
     def _name(self, block: AnyBlock) -> str:
         return ".".join(part for part in (self._device, block.spec.name) if part)
 
-    def note_faults(self) -> None:
-        """Note that axes have come into fault, and tell the daemon, before anybody can see it; and what alarms have
-        stopped. Cheap where there is none.
-        """
+    def before_telling(self) -> None:
+        """Note what anybody may see from now on, and tell the daemon first. Cheap where there is nothing."""
         if self._unshown:
             unshown, self._unshown = self._unshown, []
+            now_ns = time.monotonic_ns()
             for block, parts, at_ns in unshown:
-                self.asked.note(id(block), parts, min(at_ns, time.monotonic_ns()))
+                self.asked.note(id(block), parts, min(at_ns, now_ns))
+            self._tell(StopsShown(now_ns))
+        self.note_faults()
+
+    def note_faults(self) -> None:
+        """Note that axes have come into fault, and tell the daemon, before anybody can see it. Cheap where there is
+        none.
+        """
         for block in self._axes:
             fresh = block.bank.take_faults()
             if not fresh:

@@ -115,7 +115,7 @@ class Runtime(Ticking):
             device, self.blocks, self.outputs, self.effects, self.waits, self.pages, handles, self.log, self.tell,
             self.latch, int(options["resets"]), request, StopJournal(fds[5]), options["stop_sources"], self.journal,
         )  # fmt: skip
-        self.pages.before = self.stops.note_faults
+        self.pages.before = self.waits.before = self.stops.before_telling
         self.alarms = AlarmWatch(self.blocks, options["alarms"], self.tell, self.stops.stop_by_alarm)
         self.pages.watch = self.alarms.look if options["alarms"] else None
         parts = Parts(self, self.blocks, self.outputs, self.effects, self.waits, self.pages, self.stops, self.log)

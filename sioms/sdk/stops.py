@@ -212,16 +212,19 @@ class Stops(Resets):
 
     # --- the one stop ----------------------------------------------------------------------------
 
-    def safe_stop(self, reason: Reason, parts: Sequence[Part] | None = None) -> None:
+    def safe_stop(
+        self, reason: Reason, parts: Sequence[Part] | None = None, note: Callable[[], None] | None = None
+    ) -> None:  # fmt: skip
         """Stop axes and make outputs safe; every stop of this process is this one.
 
         The order, which docs/decisions/0176-one-safe-stop.md explains: banks, what is under way after a failure, the
-        stops of the device, the writes on their way to its outputs, the outputs, the requests that wait, the events of
-        the banks. Each is done whatever became of those before.
+        stops of the device, the writes on their way to its outputs, the outputs, the note of it, the requests that
+        wait, the events of the banks. Each is done whatever became of those before.
 
         Args:
             reason: how and why.
             parts: what stops; None: the whole device.
+            note: notes it where it outlives this process, before anybody is told.
 
         Raises:
             Exception: the first that one of them has raised, when all have been done.
@@ -241,6 +244,8 @@ class Stops(Resets):
                 steps.append(partial(engine.stop, axes))
             steps += [partial(self._drop_writes, *part) for part in whole]
             steps += [partial(self.make_safe, *part) for part in whole]
+        if note is not None:
+            steps.append(note)
         if reason.errno:  # before the events of the banks would: these know who stopped
             steps.append(partial(self._end_waits, reason, whole, told))
         steps.append(partial(self.take_events, reason.text, told))
@@ -314,7 +319,8 @@ class Stops(Resets):
     # --- nodes -----------------------------------------------------------------------------------
 
     def stop_node(
-        self, block: AnyBlock, channels: Any, bit: int, source: str, at_ns: int | None = None, by: int = 0
+        self, block: AnyBlock, channels: Any, bit: int, source: str, at_ns: int | None = None, by: int = 0,
+        note: Callable[[], None] | None = None,
     ) -> None:  # fmt: skip
         """Emergency stop of some channels, or of one bit of them: latched until reset.
 
@@ -323,12 +329,13 @@ class Stops(Resets):
             source: who asks for it, and why.
             at_ns: when that was asked for [ns, CLOCK_MONOTONIC]; None: now.
             by: number of the handle that asks for it; 0: none.
+            note: as of ``safe_stop``.
         """
         parts = self._parts(block, channels, bit)
         self.asked.note(id(block), parts, time.monotonic_ns() if at_ns is None else at_ns, by)
         if not isinstance(block, AxisBlock):
             self.latched_outputs |= {(id(block), *part): source for part in parts}
-        self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)])
+        self.safe_stop(_emergency_stop_by(source), [(block, channels, bit)], note)
 
     def stop_in_passing(self, block: AnyBlock, channels: Any, bit: int, source: str, at_ns: int) -> None:
         """Carry out an emergency stop, as ``stop_node``, that a reset of the workcell has ended before it was heard of:
@@ -354,15 +361,18 @@ class Stops(Resets):
         for each, channels, bit, name in node if reaction is Reaction.STOP_NODE else whole:
             if not isinstance(each, AxisBlock) and not each.spec.writable:
                 continue
-            self.stop_node(each, channels, bit, source)
-            spec = each.spec
-            parts = self._parts(each, channels, bit)
-            at_ns = time.monotonic_ns() + SHOWN_NS  # the daemon takes it for now, if it hears of it before
-            self._unshown.append((each, parts, at_ns))
+            note = partial(self._note_unshown, each, self._parts(each, channels, bit), name, source)
+            self.stop_node(each, channels, bit, source, note=note)
             self._log("warning", f"emergency stop of {name} by {source}")
-            self._note(
-                node_entry(name, self._device, spec.name, parts, source, stop=True, pid=os.getpid(), at_ns=at_ns)
-            )
+
+    def _note_unshown(self, block: AnyBlock, parts: list[tuple[int, int]], name: str, source: str) -> None:
+        """Note the stop of a node that nobody has asked for, and nobody can have seen yet."""
+        at_ns = time.monotonic_ns() + SHOWN_NS
+        self._unshown.append((block, parts, at_ns))
+        entry = node_entry(
+            name, self._device, block.spec.name, parts, source, stop=True, pid=os.getpid(), at_ns=at_ns
+        )  # fmt: skip
+        self._note(entry)
 
     def restore(self, stopped: Iterable[tuple[str, list[list[int]], str, str]]) -> None:
         """Stop what was stopped when the process before this one ended, before anything can move.

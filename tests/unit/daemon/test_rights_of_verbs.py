@@ -96,7 +96,7 @@ class Workcell:
         self.loads: list[tuple[Callable[..., None], Callable[[], bool]]] = []
         self.done: list[str] = []
         latch = SimpleNamespace(stopped_ns=0, source="")
-        record = SimpleNamespace(look=lambda: None, state=SimpleNamespace(nodes=list))
+        record = SimpleNamespace(look=lambda: None, shown=lambda _: None, state=SimpleNamespace(nodes=list))
         shared: Any = SimpleNamespace(
             markers=MarkerTable(memoryview(bytearray(TABLE_SIZE))), latch=latch, record=record,
             files=SimpleNamespace(client_fds=[]), journal=OwnJournal(),

@@ -39,7 +39,9 @@ class Rig:
         self.latch.begin(0, self.request.mark)
         self.noted: list[str] = []
         state = SimpleNamespace(workcell="")
-        record = SimpleNamespace(look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes())
+        record = SimpleNamespace(
+            look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes(), unshown=list
+        )
         shared: Any = SimpleNamespace(latch=self.latch, request=self.request, record=record)
         cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
         self.cell, self.stops, self._state = cell, Stops(cell), state
@@ -211,6 +213,40 @@ def test_stops_that_drivers_have_noted_have_been_asked_for(tmp_path: Path) -> No
     assert record.asked.latest_ns(("mod0", ""), {0: 1}, 0) == at_ns
     record.close()
     driver.close()
+
+
+@pytest.mark.parametrize("by", ["its driver", "a status", "a refusal", "time"])
+def test_a_stop_by_an_alarm_is_younger_than_any_reset_until_it_can_be_known(
+    start: Callable[[], Daemon], monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    """And no longer: who has seen it and resets at once is not refused."""
+    daemon, now_ns = start(), time.monotonic_ns()
+    monkeypatch.setattr(time, "monotonic_ns", lambda: now_ns)
+    daemon.cell.names = SimpleNamespace(  # type: ignore[assignment]
+        devices={"mod0": SimpleNamespace(blocks=[SimpleNamespace(name="", channels=[SimpleNamespace(width=0)] * 2)])}
+    )
+    x, y = (SimpleNamespace(name="n", device="mod0", block=0, channels=[c], bit=-1) for c in (0, 1))
+    entry = node_entry("mod0.x", "mod0", "", [(0, 0)], "an alarm", stop=True, pid=PID, at_ns=now_ns + 1_000_000)
+    daemon.drivers_journal.append(entry, time.time())
+    for node, is_later in ((x, True), (y, False), (None, True)):
+        assert daemon.stops.stopped_since(now_ns, 1, node) is is_later  # type: ignore[arg-type]
+    now_ns += 100
+    match by:
+        case "its driver":
+            daemon.record.shown(now_ns, "mod1")
+            assert daemon.stops.stopped_since(now_ns, 1), "another driver shows others"
+            daemon.record.shown(now_ns, "mod0")
+        case "a status":
+            daemon.record.shown(now_ns)
+        case "a refusal":
+            assert daemon.stops.stopped_by() == "n: an alarm" or "alarm" in daemon.stops.stopped_by(x)  # type: ignore[arg-type]
+        case "time":
+            now_ns += 1_000_000
+            assert daemon.stops.stopped_since(now_ns - 101, 1), "at the latest a millisecond after it"
+            now_ns -= 100
+    for instant_ns, is_later in ((now_ns - 1, True), (now_ns, False)):
+        for node in (x, None):
+            assert daemon.stops.stopped_since(instant_ns, 1, node) is is_later  # type: ignore[arg-type]
 
 
 def test_what_lay_in_a_socket_before_it_was_stamped_is_as_old_as_can_be() -> None:

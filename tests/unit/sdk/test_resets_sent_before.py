@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,9 +15,12 @@ from sender_rig import AXIS, LATER_NS, Sender, fault, in_fault, order, world
 
 from sioms.drivers.sim.axes import SimAxes
 from sioms.drivers.sim.io import SimIo
-from sioms.protocol.driver_verbs import DriverVerb
+from sioms.protocol.driver_verbs import FROM_DRIVER, DriverVerb, StopsShown
 from sioms.protocol.flags import Reaction, Request
+from sioms.protocol.page import PageWriter
 from sioms.protocol.stopjournal import StopJournal, node_entry, parts_of, replay
+from sioms.protocol.verbs import take
+from sioms.sdk.handles import Handle
 from sioms.sdk.stops import SHOWN_NS
 
 
@@ -82,6 +86,65 @@ def test_a_stop_by_an_alarm_that_the_daemon_shows_is_reset_though_a_slow_device_
     axes.order(DriverVerb.NODE_RESET, 0, [0], -1, "eva", axes.latch.resets, CLOCK(), sent_ns)
     axes.runtime.heed()
     assert not block.bank.is_stopped(0)
+
+
+def _shown_ns(world: World) -> list[int]:
+    """Return what the driver has told of since when its stops can be known."""
+    told: list[int] = []
+    with suppress(BlockingIOError):
+        while True:
+            _, message = take(world.control.recv(1 << 16), FROM_DRIVER)
+            told += [message.at_ns] if isinstance(message, StopsShown) else []
+    return told
+
+
+def _stop_by_alarm(world: World) -> None:
+    rule: Any = SimpleNamespace(node="mod0.x", stops=[0], bit=-1)
+    world.runtime.stops.stop_by_alarm(Reaction.STOP_NODE, world.runtime.blocks[0], rule, "too far")
+
+
+def test_the_daemon_hears_of_a_stop_by_an_alarm_before_a_reading_shows_it(
+    axes: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    block, told = axes.runtime.blocks[0], []
+    _stop_by_alarm(axes)
+    assert not _shown_ns(axes), "nobody can know of it"
+    publish = PageWriter.publish
+    monkeypatch.setattr(PageWriter, "publish", lambda *of: (told.extend(_shown_ns(axes)), publish(*of))[1])
+    CLOCK.now_ns += LATER_NS
+    before_ns = CLOCK.now_ns
+    axes.runtime.publish(block, CLOCK())
+    assert len(told) == 1 and before_ns < told[0] <= CLOCK.now_ns
+    axes.runtime.publish(block, CLOCK())
+    assert len(told) == 1
+
+
+@pytest.mark.parametrize("by", ["alarm", "client"])
+def test_who_waits_is_not_told_of_a_stop_before_it_is_kept(
+    axes: World, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    """A reset that he sends through the daemon is noted behind the stop then."""
+    owner, other = Sender(axes, axes.open(0, [0], exclusive=True)), Sender(axes, axes.open(0, [0], exclusive=False))
+    owner.jog()
+    owner.post(owner.client.node._ioctl(Request.WAIT_UNTIL_IDLE, None, None))
+    assert owner.served() == [None]
+    kept: list[Any] = []
+    refuse = Handle.refuse
+
+    def refused(*arguments: Any) -> None:
+        state = replay(os.pread(axes.journal, 1 << 16, 0).rstrip(b"\0"), 0, 0.0)
+        kept.append((state.nodes(), len(_shown_ns(axes))))
+        refuse(*arguments)
+
+    monkeypatch.setattr(Handle, "refuse", refused)
+    if by == "alarm":
+        _stop_by_alarm(axes)
+    else:
+        other.post(other.client.node._ioctl(Request.EMERGENCY_STOP, None, None))
+        other.served()
+    assert owner.served() == [None, errno.ECANCELED]
+    assert len(kept) == 1 and len(kept[0][0]) == 1, "the stop is in the journal by then"
+    assert kept[0][1] == (by == "alarm"), "and the daemon knows that it can be known"
 
 
 def test_a_reset_by_the_daemon_that_was_sent_before_a_fault_leaves_it(axes: World, tmp_path: Any) -> None:
