@@ -178,7 +178,7 @@ RECORDED: list[tuple[Message, str]] = [
     (Detached(7), "93150507"),
     (MarkerSignalled(9), "93160509"),
     (Stopped("io0.bit3"), "931705a8696f302e62697433"),
-    (StopsShown(5), "931c0005"),
+    (StopsShown(5), "931c0505"),
     (LinkChanged(2, "unplugged"), "94180502a9756e706c7567676564"),
     (AlarmChanged(0, 1, -1, "fault", 2, "stalled", 9), "991a050001ffa56661756c7402a77374616c6c656409"),
     (HeldSilent("mod0", "mute"), "941b05a46d6f6430a46d757465"),
