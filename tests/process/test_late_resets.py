@@ -14,6 +14,7 @@ from daemon_rig import Daemon, Waiting, put_in_fault, raises, wait_for
 import sioms
 from sioms.bridges.leases import Leases
 from sioms.bridges.prompt import LATE_NS, SETTLE_NS, Prompt
+from sioms.client.cell_verbs import request_stop, stop_call
 from sioms.client.channel import Call
 from sioms.client.stopping import emergency_stop
 from sioms.protocol.flags import PROTOCOL_VERSION, AxisStatus
@@ -68,6 +69,18 @@ def test_a_reset_that_the_daemon_serves_late_leaves_a_later_stop_past_it(daemon:
         assert _latched(seen) and cell.status()["stopped_ns"]
         cell.reset()
         wait_for(lambda: not _latched(seen), "reset")
+
+
+def test_a_stop_that_has_been_reset_does_not_come_again_with_its_message(daemon: Daemon, cell: sioms.Workcell) -> None:
+    """Who stops writes a request that drivers obey, and may lose the processor before he tells the daemon."""
+    with daemon.cell("stopper") as stopper, cell.open("mod0.xaxis", "rw", timeout=5.0) as axis:
+        asked = request_stop(stopper._request, "enough")
+        assert asked is not None
+        wait_for(asked, "drivers have obeyed")
+        cell.reset()
+        stopper._channel.call(stop_call("", "enough", False, asked))
+        assert not cell.status()["stopped_ns"]
+        axis.move(axis.read().position[0], timeout=1.0)
 
 
 @pytest.mark.parametrize("name", ["mod0.xaxis", ""])
