@@ -196,7 +196,7 @@ def test_who_has_missed_a_stop_stops_also_where_its_reset_is_half_done() -> None
     seen: list[bool] = []
 
     def act(cell: Cell) -> None:
-        cell.take(("hear", AXIS))
+        cell._process(AXIS).runtime.stops.heed()  # as each tick does, whatever the daemon has told
         seen.append(cell._process(AXIS).runtime.driver.moves())  # type: ignore[attr-defined]
 
     for _, place, answer in meetings([("move", OWNER, AXIS), ("stop", STOPPER)], "reset", act):
