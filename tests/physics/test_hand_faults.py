@@ -147,7 +147,7 @@ def test_a_finger_that_turns_doubtful_is_told(state: State) -> None:
 
 
 def test_what_no_module_reaches_any_more_is_not_moved_to() -> None:
-    one = trial(State.FEEL, lambda trial, reading: reading)
+    one = trial(State.CLOSE, lambda trial, reading: reading)
     one.skills.manner = replace(MANNER, reach=(-1.0, 1.0, 0.5, 1.0))
     with pytest.raises(Failed, match=r"regrasp object: module 1 would have to be at") as failed:
         one.run()
