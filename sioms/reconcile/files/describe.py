@@ -16,8 +16,9 @@ from sioms.reconcile.errors import BadInputError
 from sioms.reconcile.files.heads import WORDS, meaning
 from sioms.reconcile.files.table import SUFFIXES, UNITS, Array, Table, load_table, measures, named
 
-#: Two columns say the same from this correlation on; one changes evenly where its steps vary by less than this share.
-SAME, EVEN = 0.98, 0.1
+#: Two columns say the same from this correlation on; one rises evenly where all but so few of its steps are within this
+#: share of the usual one: some rows of a polled log come late.
+SAME, EVEN, LATE = 0.98, 0.1, 0.1
 #: A column of time steps of the log may vary by so much of one: polled, not sampled.
 POLLED = 0.5
 #: Rows that tell what a column is.
@@ -169,7 +170,8 @@ def _by_numbers(values: Array, table: Table, taken: Mapping[str, str]) -> tuple[
         return None, f"{int(np.sum(~np.isfinite(values)))} of its values are no numbers"
     if np.ptp(values) == 0.0:
         return None, f"constant at {values[0]:.6g}"
-    if "time" not in taken and np.all(steps > 0.0) and np.std(steps) < EVEN * np.mean(steps):
+    usual = float(np.median(steps))
+    if "time" not in taken and np.all(steps > 0.0) and np.mean(np.abs(steps - usual) > 1.001 * EVEN * usual) < LATE:
         return "time", "it rises by even steps"
     if "index" not in taken and np.array_equal(np.unique(values), (0.0, 1.0)) and np.mean(values) < RARE:
         return "index", "it is 1 now and then"

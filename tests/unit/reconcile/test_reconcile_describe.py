@@ -71,6 +71,13 @@ def test_columns_without_heads_are_told_by_their_numbers() -> None:
     assert list(found.values()) == ["time", "position", "velocity", "command", "index", None, None]
 
 
+def test_a_time_of_which_some_rows_come_late_is_no_position() -> None:
+    late = np.cumsum(np.where(np.arange(len(T)) % 60 == 7, 260.0, np.where(np.arange(len(T)) % 12 == 3, 11.0, 10.0)))
+    found = quantities({"column 1": late, "column 2": X})
+    assert found["column 1"] == "time"
+    assert found["column 2"] != "time"
+
+
 def test_a_speed_beside_it_tells_a_position_and_steps_tell_none() -> None:
     set_by_hand = np.repeat([0.2, -0.3, 0.1, 0.4], 500)
     turning = 30.0 * T + X  # it runs on and on
