@@ -68,6 +68,7 @@ class Searcher(Search[AxisModel]):
     ids: NDArray[np.int64] = field(init=False)
     _given: Problem = field(init=False)
     _fits: dict[Hashable, Fit] = field(init=False, default_factory=dict)
+    _losses: dict[Hashable, Array] = field(init=False, default_factory=dict)
     _starts: dict[Hashable, list[Start]] = field(init=False, default_factory=dict)
     _polished: set[Hashable] = field(init=False, default_factory=set)
     _rough: set[Hashable] = field(init=False, default_factory=set)
@@ -128,9 +129,14 @@ class Searcher(Search[AxisModel]):
         return fit
 
     def loss(self, fit: Fit) -> Array:
-        """Held-out loss per block; beside a gap, whose rough cost has no slope to go by, with all numbers as they
-        are.
-        """
+        """Held-out loss per block; what was asked before is looked up."""
+        key = (values_of(fit.model), fit.free)
+        if key not in self._losses:
+            self._losses[key] = self._loss(fit)
+        return self._losses[key]
+
+    def _loss(self, fit: Fit) -> Array:
+        """Score a fit; beside a gap, whose rough cost has no slope to go by, with all numbers as they are."""
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
         losses = heldout(
@@ -170,6 +176,7 @@ class Searcher(Search[AxisModel]):
             return fit
         self.problem = bent(self._given, fit.model) if rattles(fit.model) else self._given
         self._fits.clear()
+        self._losses.clear()
         self._starts.clear()
         self._rough.clear()
         return self.fit(fit.model)
@@ -401,6 +408,10 @@ class Searcher(Search[AxisModel]):
                     middle = self._with(base, s, 5)
                     out += [(s.effect, self._with(middle, again, 6)) for again in self._upgrades(middle, [name])[:1]]
         return out
+
+    def hopeless(self, new: Fit, losses: Array, least: float) -> bool:
+        """Say whether a fit leaves too much of all blocks, to which it was fitted, to save a share of held-out ones."""
+        return new.cost > (1.0 - least) * float(losses.sum())
 
     def surely(self, saved: Saving, least: float, name: str) -> bool:
         """Say whether an effect saves at least a share, surely; one whose order is searched must do so more surely."""

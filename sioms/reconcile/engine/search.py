@@ -173,6 +173,10 @@ class Search(ABC, Generic[M]):
         """Say whether an effect saves at least a share, surely."""
         return saved.share >= least and saved.errors >= SURE
 
+    def hopeless(self, new: Fit[M], losses: Array, least: float) -> bool:
+        """Say whether a fit cannot save a share on held-out blocks, for it does not on those that it was fitted to."""
+        return False
+
     def loudest(self, fit: Fit[M]) -> float:
         """Return the largest root mean square of a view, in units of its floor."""
         return fit.ratio
@@ -261,14 +265,15 @@ class Search(ABC, Generic[M]):
             middle = self.fit(self.switched_on(fit, first), 5, fit.cost)
             if middle.cost > fit.cost:  # it only takes the place of something better
                 continue
-            inner = self.loss(middle)
+            inner: Array | None = None
             for second in self.beside(middle, first):
                 best = min((t.fit.cost for t in pairs.values()), default=middle.cost)
                 new = self.fit(self.switched_on(middle, second), 8, best)
                 name = self.pair(first.effect, second.effect, new)
-                if name is None:
+                if name is None or self.hopeless(new, losses, SPECIFIC):
                     continue
                 loss = self.loss(new)
+                inner = self.loss(middle) if inner is None else inner
                 saved = self.saving(loss, losses)
                 much = self.surely(saved, SPECIFIC, "") and self.surely(
                     self.saving(loss, inner), SPECIFIC, second.effect
