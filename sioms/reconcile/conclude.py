@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.stats import binom
 
-from sioms.reconcile.ambiguity import Rival
+from sioms.reconcile.ambiguity import Rival, lookalikes
 from sioms.reconcile.axis_verdict import AxisVerdict, Trace
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.controlled import foreign
@@ -59,6 +59,7 @@ from sioms.reconcile.thresholds import (
     UNEXPLAINED,
 )
 from sioms.reconcile.timed import as_recorded
+from sioms.reconcile.uneven import Uneven, uneven
 from sioms.reconcile.variation import named as varied
 from sioms.reconcile.verdict import Candidate, Gap, NamedEffect, Outcome, Place
 
@@ -84,6 +85,8 @@ REFUSED_BEYOND = "too much remains beside it for a part to be told"
 REFUSED_IDLE = "held-out samples are met as well without it: it may stand for a part of what remains"
 REFUSED_SMALL = "beside a formula without a name that explains far more it may be what that formula lacks"
 REFUSED_BOUND = "a number of it is at the end of what it can be: it stands for something else"
+REFUSED_UNEVEN = "its numbers are not the same everywhere, they change with {}: its law is another one"
+REFUSED_ALIKE = "the law of what it looks like is another one, and it may make up for that"
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +142,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     blindly = ready.blind and any(e.name == PAYLOAD for e in named)
     wave = locked(ready.problem, found.fit)
     missing = missing or (wave is not None and wave.share > (MOSTLY_LOCKED if named else LOCKED))
+    changing = [] if missing else _changing(s, named)
+    missing = missing or bool(changing)
     drives = [f.effect for f in ready.findings if f.doubted]
     said = outcome(bool(named), missing, bool(open_rivals) or blindly or bool(drives))
     gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)
@@ -150,16 +155,18 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes.append(wave.text)
     if disturbance:
         notes.append(_of_bursts(ready.problem, found.fit, burst))
-    elif beyond:
+    elif beyond or (ratio > LOUD and not (ready.points or rattles(found.fit.model))):
         notes.append(_of_much(ratio, s.share))
     if not judged.refusals:
         notes += likened(s.searcher, found)
         if any(e.name in OPPOSING for e in terms):
             notes += [text for text in (friction_told(whole, fit),) if text]
             named = [_at_rest(e, whole, fit, notes) for e in named]
+    notes += [_of_change(known()[c.effect].title, c, ratio) for c in changing]
     if ready.blind:
         notes.insert(0, remark(nominal))
     tried = refused(named, leaning, bool(judged.refusals), beyond)
+    tried += another_law(named, changing)
     if judged.refusals:
         tried += tuple(Candidate(e.name, e.title, REFUSED_FREE) for e in terms if e.name in fit.model.effects)
     elif said is Outcome.UNEXPLAINED and not rattles(fit.model):
@@ -216,6 +223,30 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         states=tuple((r.name, q) for r, q in zip(ready.final.session.records, states, strict=True)),
         rejected=s.rejected,
         others=tuple(q.fit.model.effects for q in open_now),
+    )
+
+
+def _changing(s: Searched, named: Sequence[NamedEffect]) -> list[Uneven]:
+    """Return what is named whose numbers are not the same everywhere; beside a gap the remainder is of bounces."""
+    fit = s.found.fit
+    if s.searcher.done(fit) or rattles(fit.model):
+        return []
+    return uneven(s.ready.problem, fit, [e.name for e in named if e.name not in s.searcher.frozen])
+
+
+def another_law(named: Sequence[NamedEffect], changing: Sequence[Uneven]) -> tuple[Candidate, ...]:
+    """Refuse the names whose numbers change, and those that look like them."""
+    why = {c.effect: REFUSED_UNEVEN.format(c.variable) for c in changing}
+    alike = {other for name in why for other in lookalikes(name)}
+    return tuple(
+        Candidate(e.name, e.title, why.get(e.name, REFUSED_ALIKE)) for e in named if e.name in alike.union(why)
+    )
+
+
+def _of_change(title: str, change: Uneven, ratio: float) -> str:
+    return (
+        f"{title}: what remains is {ratio:.2g} times what noise would leave, and {100 * change.share:.0f} % of it are "
+        f"explained where its numbers change with {change.variable}; its law is another one"
     )
 
 

@@ -263,6 +263,12 @@ PLACES_A_PERIOD = 1.0
 of a smooth law over the same travel, an eighth of it: what is longer, a law can be made of. Cogging that took two
 periods a turn of a detent, on two turns: two places; true cogging of 14 periods a turn there 0.3 (0970)."""
 
+UNEVEN, UNEVEN_PATH = 0.08, 0.5
+"""What is named has another law where the first share of what remains is explained, surely, once its numbers may change
+with a variable; of friction that builds up over a path, the second. Some hundred axes fitted with the right effects
+(seeds 981601 to 981604 and the forty): 0.06 at most, of friction that builds up 0.36; fifteen look-alikes in the place
+of other laws: 0.08 to 0.98, of friction that builds up 0.62 to 0.77 (1056)."""
+
 # --- what keeps time
 
 HALVED, ROUGHLY, ABOUT = 0.5, 2.0, 1.25
