@@ -277,10 +277,13 @@ class Stops:
 
     def look(self) -> None:
         """Take up what has been asked for and noted by others since the last look."""
+        record = self._shared.record
+        record.look()
+        requested = record.state.requested  # of our file it is heard now; a driver of a daemon before us reads another
         self.hear_request()
-        self._shared.record.look()
-        if (source := self._shared.record.state.workcell) and not self._shared.latch.stopped_ns:
-            self.stop_workcell(source)  # a driver could not keep a stop
+        source = record.state.workcell or (record.state.requested_by if requested else "")
+        if source and not self._shared.latch.stopped_ns:
+            self.stop_workcell(source)  # or a driver could not keep a stop
         self._pass_on_stops()
 
 

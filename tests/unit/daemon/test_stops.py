@@ -311,8 +311,10 @@ class Daemon:
         os.close(self.record.drivers_fd)
 
     def let_go(self) -> None:
-        """Close what the daemon has open but for its journal, and the drivers' of that."""
+        """Close what the daemon has open."""
         shared = self.shared
+        if not self.record._flusher._ends:
+            self.die()
         for fd in (shared.fds[0], shared.fds[3], *shared.files.client_fds, shared.journal.fd):
             os.close(fd)
         self.cell.timestamps.close()
@@ -461,3 +463,20 @@ def test_a_stop_that_a_driver_notes_at_the_end_of_the_daemon_is_kept(start: Call
     first.shared.files.remove()
     first.record.close()
     assert "fire" in start().stopped_by
+
+
+def test_what_a_driver_of_the_daemon_before_obeys_stops_the_next_one(start: Callable[[], Daemon]) -> None:
+    """Whoever had a session with the daemon that has died asks by its file, and is told that this has been taken."""
+    first = start()
+    first.die()
+    again = start()
+    again.reset()
+    mark = first.request.request(1000, PID, "fire")
+    first.obey(mark, 0)
+    assert first.request.taken(mark)
+    assert "fire" in again.stopped_by and again.shared.latch.stopped_ns
+    again.reset()
+    assert not again.stopped_by and not again.shared.latch.stopped_ns
+    again.shared.files.remove()
+    again.record.close()
+    assert not start().stopped_by
