@@ -12,6 +12,7 @@ from sioms.protocol.nodeinfo import NodeInfo
 from sioms.protocol.stopfile import StopRequest
 from sioms.protocol.text import printable, shown
 
+from .arguments import checked
 from .arguments import number as as_number
 from .channel import Call, Channel
 from .local import RENEWED_NS, node_parts
@@ -359,6 +360,7 @@ class WorkcellVerbs(Session[M]):
 
     async def _stop(self, node: str, why: str, or_all: bool = False) -> None:
         why = printable(str(why))
+        checked("emergency stop", verbs.EmergencyStop(node, why, or_all, 0))  # a name that is none stops nothing
         taken = request_stop(None if node else self._request, why)
         try:
             await self._waiter.call(stop_call(node, why, or_all, taken))
