@@ -100,6 +100,13 @@ def _marks(entry: Mapping[str, Any]) -> list[Mark]:
     return [(int(word), int(changed_ns)) for word, changed_ns in ([[marks, 0]] if type(marks) is int else marks)]
 
 
+def is_earlier(mark: Mark, other: Mark) -> bool:
+    """Tell whether a request to a file was there before another of it, or is it. Who is held up between looking at the
+    clock and writing is the last with an earlier word, and the clock of files may be set: both have to be earlier.
+    """
+    return mark == other or (mark[0] < other[0] and mark[1] < other[1])
+
+
 def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
     """Return parts as [first channel, last channel, bits]: a node of 10,000 channels is one line of 60 bytes."""
     bits: dict[int, int] = {}
@@ -193,11 +200,8 @@ class Stopped:
             self.requested = [*self.requested, marks[0]][-MOST_REQUESTED:]
 
     def _has_answered(self, mark: Mark) -> bool:
-        """Tell whether what was written to the file has been answered, be it that this is noted behind its reset. Who
-        is held up between looking at the clock and writing is the last with an earlier word, and the clock of files may
-        be set: both have to be earlier.
-        """
-        return any(mark == each or (mark[0] < each[0] and mark[1] < each[1]) for each in self.answered)
+        """Tell whether what was written to the file has been answered, be it that this is noted behind its reset."""
+        return any(is_earlier(mark, each) for each in self.answered)
 
     def take(
         self, entry: Mapping[str, Any] | None, damage: str = "a line that is not an entry", now_s: float = 0.0

@@ -37,7 +37,7 @@ class Rig:
         self.latch = Latch(memoryview(bytearray(LATCH_SIZE)))
         self.latch.begin(0, self.request.mark)
         self.noted: list[str] = []
-        state = SimpleNamespace(workcell="")
+        state = SimpleNamespace(workcell="", requested=[])
         record = SimpleNamespace(
             look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes(), unshown=list
         )
@@ -480,3 +480,22 @@ def test_what_a_driver_of_the_daemon_before_obeys_stops_the_next_one(start: Call
     again.shared.files.remove()
     again.record.close()
     assert not start().stopped_by
+
+
+@pytest.mark.parametrize("is_heard", [True, False])
+def test_no_reset_ends_what_a_driver_of_the_daemon_before_has_obeyed_just_now(
+    start: Callable[[], Daemon], is_heard: bool
+) -> None:
+    first = start()
+    first.die()
+    again = start()
+    again.stops.stop_workcell("eva")
+    first.obey(first.request.request(1000, PID, "fire"), 0)
+    if is_heard:
+        assert "fire" in again.stops.hear_request(), "which refuses the reset"
+        assert not again.stops.hear_request()
+    again.stops.reset_workcell("ann", time.monotonic_ns(), 1)
+    again.stops.look()
+    assert bool(again.shared.latch.stopped_ns) is not is_heard
+    again.reset()
+    assert not again.stopped_by and not again.shared.latch.stopped_ns
