@@ -49,6 +49,7 @@ class Shared:
         self.fds = [latch_fd, self.files.fd, self.files.taken_fd, markers_fd, record.drivers_fd]
         self.latch = Latch(latch)
         self.request = StopRequest(self.files.fd, self.files.taken_fd)
+        record.inode = self.request.inode
         self.latch.begin(record.state.resets, self.request.mark)
         self.markers = MarkerTable(markers)
         self._note(file_entry(self.request.mark))

@@ -18,7 +18,8 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from sioms.part_times import PartTimes
-from sioms.protocol.stopjournal import CHECKPOINT, PID, StopJournal, Stopped, asked_ns, entries_from, replay
+from sioms.protocol.stopjournal import CHECKPOINT, INODE, PID, StopJournal, Stopped, asked_ns, entries_from, replay
+from sioms.protocol.text import printable
 
 from .realtime import end_promptly
 
@@ -45,7 +46,10 @@ class StopRecord:
     Attributes:
         state: what is stopped, after the last ``look``.
         drivers_fd: descriptor for drivers, to append to.
+        inode: of the stop-request file of this daemon, 0 before it is made.
         by_drivers: entries of drivers that have been read, the oldest first; who has seen to them takes them out.
+        elsewhere: who has asked, by the file of a daemon before, for a stop that a driver of that has obeyed since this
+            daemon began; as these.
         asked: when stops have been asked for since this daemon began; of one by an alarm, when it could be known.
     """
 
@@ -67,7 +71,9 @@ class StopRecord:
         size = os.fstat(self._fd).st_size
         start = max(_first_byte(self._fd, size), size - LARGEST)
         self.state: Stopped = replay(_read(self._fd, start, size), start, time.time())
+        self.inode = 0
         self.by_drivers: list[Mapping[str, Any]] = []
+        self.elsewhere: list[str] = []
         self.asked = PartTimes()
         self._unshown: list[tuple[Part, int]] = []
         self._at = size
@@ -97,7 +103,10 @@ class StopRecord:
         entries, read = entries_from(_read(self._fd, self._at, size))
         self._at += read
         for entry in entries:
+            requested = self.state.requested
             self.state.take(entry, now_s=time.time())
+            if entry and entry.get(INODE, self.inode) != self.inode and self.state.requested is not requested:
+                self.elsewhere.append(printable(str(entry["by"]), 400))
             if entry and PID in entry:
                 self.by_drivers.append(entry)
                 at_ns, now_ns = asked_ns(entry), time.monotonic_ns()

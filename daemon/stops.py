@@ -12,16 +12,12 @@ from typing import Any
 
 from sioms.protocol import driver_verbs
 from sioms.protocol.stopfile import SOMEBODY
-from sioms.protocol.stopjournal import NODE, PID, asked_ns, is_earlier, node_entry, parts_of, workcell_entry
+from sioms.protocol.stopjournal import NODE, PID, asked_ns, node_entry, parts_of, workcell_entry
 from sioms.protocol.verbs import Message
 
 from .cell import Cell
 from .devices import DriverProcess
 from .names import Node
-
-TYPE_CHECKING = False
-if TYPE_CHECKING:
-    from sioms.protocol.stopfile import Mark
 
 FILE_CLOCK_NS = 10_000_000
 """How far the time of a file's last change may lie before it: the kernel's clock of files goes in ticks [ns]."""
@@ -38,8 +34,6 @@ class Stops:
         self._cell = cell
         self._shared = cell.shared
         self._request_seen = self._shared.latch.answered_request
-        self._noted: list[Mark] = []
-        """Requests that drivers have noted, of which the workcell has been stopped."""
 
     def restore(self) -> None:
         """Be stopped from the beginning when it was so at the end."""
@@ -79,18 +73,17 @@ class Stops:
         A client that could not reach us has asked the drivers directly; they have acted already, as a rule.
         """
         request, record = self._shared.request, self._shared.record
-        record.look()  # first: what is noted of our file is heard with it
-        before, self._noted, source = self._noted, record.state.requested, ""
-        if (seen := request.mark) != self._request_seen:
-            self._request_seen = seen
-            source, heard = request.source, request.obeyed == seen
-            self.stop_workcell(source, asked_ns=self._written_ns(seen))
-            request.take(seen)
-            source = "" if heard else source
-        if any(mark not in before and not is_earlier(mark, seen) for mark in self._noted):
-            source = record.state.requested_by
+        record.look()
+        elsewhere, record.elsewhere = record.elsewhere, []
+        for source in elsewhere:
             self.stop_workcell(source)
-        return source
+        if (mark := request.mark) == self._request_seen:
+            return elsewhere[0] if elsewhere else ""
+        self._request_seen = mark
+        source, heard = request.source, request.obeyed == mark
+        self.stop_workcell(source, asked_ns=self._written_ns(mark))
+        request.take(mark)
+        return "" if heard and not elsewhere else source
 
     def _written_ns(self, mark: tuple[int, int]) -> int:
         """Return when a request was written to the file [ns, CLOCK_MONOTONIC]: as its word says, or the time of the
@@ -133,7 +126,7 @@ class Stops:
         record.look()
         marks = [answered, *self._shared.left]
         if self._shared.request.mark == answered:  # then what drivers have read there was before it, whatever its mark
-            marks += self._noted
+            marks += record.state.requested
         entry = workcell_entry(who, stop=False, resets=latch.resets + 1, requests=marks)
         self._note(entry)  # first: a later stop is noted after it
         sent_ns = max(sent_ns, record.asked.own_of_any_ns(by))

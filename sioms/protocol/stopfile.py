@@ -61,6 +61,11 @@ class StopRequest:
         return mark
 
     @property
+    def inode(self) -> int:
+        """The number of the file, which no other has as long as this one is open."""
+        return os.fstat(self._fd).st_ino
+
+    @property
     def source(self) -> str:
         """Who requested last and why, as far as it said.
 

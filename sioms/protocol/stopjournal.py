@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     """(device, block, channel, bit): a piece that can be stopped by itself; bit 0 for a channel without bits."""
 
 NODE, WORKCELL, CHECKPOINT, PID, ASKED = "node", "workcell", "checkpoint", "pid", "asked"
-RESETS, REQUEST, FILE = "resets", "request", "file"
+RESETS, REQUEST, FILE, INODE = "resets", "request", "file", "inode"
 MOST_REQUESTED = 64
 """Requests that drivers have obeyed, of which the journal knows at a time; of more it knows the last."""
 MOST_PARTS = 1 << 20
@@ -72,7 +72,7 @@ def parts_of(channel: int, bit: int, width: int) -> list[tuple[int, int]]:
 
 
 def workcell_entry(
-    source: str, *, stop: bool, named: bool = False, resets: int = 0, requests: Sequence[Mark] = ()
+    source: str, *, stop: bool, named: bool = False, resets: int = 0, requests: Sequence[Mark] = (), inode: int = 0
 ) -> dict[str, Any]:  # fmt: skip
     """Return the entry of the stop or the reset of the workcell.
 
@@ -82,8 +82,10 @@ def workcell_entry(
         named: it says better who has stopped it.
         resets: how many resets there had been before a stop by the stop-request file; of a reset, with itself.
         requests: mark of the file that a driver obeys; of a reset, those that it answers, that of the file first.
+        inode: of the file that a driver has read; 0: unknown.
     """
-    known = {key: value for key, value in ((RESETS, resets), (REQUEST, [list(mark) for mark in requests])) if value}
+    marks = [list(mark) for mark in requests]
+    known = {key: value for key, value in ((RESETS, resets), (REQUEST, marks), (INODE, inode)) if value}
     return {WORKCELL: "", "stop": stop, "by": source, **({"named": True} if named else {}), **known}
 
 
@@ -98,13 +100,6 @@ def _marks(entry: Mapping[str, Any]) -> list[Mark]:
     """Return the marks that an entry names; before version 6 these were words alone."""
     marks = entry.get(REQUEST, [])
     return [(int(word), int(changed_ns)) for word, changed_ns in ([[marks, 0]] if type(marks) is int else marks)]
-
-
-def is_earlier(mark: Mark, other: Mark) -> bool:
-    """Tell whether a request to a file was there before another of it, or is it. Who is held up between looking at the
-    clock and writing is the last with an earlier word, and the clock of files may be set: both have to be earlier.
-    """
-    return mark == other or (mark[0] < other[0] and mark[1] < other[1])
 
 
 def _packed(parts: Iterable[tuple[int, int]]) -> list[list[int]]:
@@ -200,8 +195,11 @@ class Stopped:
             self.requested = [*self.requested, marks[0]][-MOST_REQUESTED:]
 
     def _has_answered(self, mark: Mark) -> bool:
-        """Tell whether what was written to the file has been answered, be it that this is noted behind its reset."""
-        return any(is_earlier(mark, each) for each in self.answered)
+        """Tell whether what was written to the file has been answered, be it that this is noted behind its reset. Who
+        is held up between looking at the clock and writing is the last with an earlier word, and the clock of files may
+        be set: both have to be earlier.
+        """
+        return any(mark == each or (mark[0] < each[0] and mark[1] < each[1]) for each in self.answered)
 
     def take(
         self, entry: Mapping[str, Any] | None, damage: str = "a line that is not an entry", now_s: float = 0.0

@@ -193,7 +193,9 @@ class Stops(Resets):
             if (resets, mark) == self._taken:
                 return
             if mark != answered:
-                self._note(workcell_entry(self._request.source, stop=True, resets=resets, requests=[mark]))
+                request = self._request
+                entry = workcell_entry(request.source, stop=True, resets=resets, requests=[mark], inode=request.inode)
+                self._note(entry)
             self._request.take(mark)
             self._taken = resets, mark
 

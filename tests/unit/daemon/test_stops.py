@@ -37,9 +37,9 @@ class Rig:
         self.latch = Latch(memoryview(bytearray(LATCH_SIZE)))
         self.latch.begin(0, self.request.mark)
         self.noted: list[str] = []
-        state = SimpleNamespace(workcell="", requested=[])
+        state = SimpleNamespace(workcell="")
         record = SimpleNamespace(
-            look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes(), unshown=list
+            look=lambda: None, state=state, note=self._note, path="stops", asked=PartTimes(), unshown=list, elsewhere=[]
         )
         shared: Any = SimpleNamespace(latch=self.latch, request=self.request, record=record)
         cell = Cell(SimpleNamespace(), Log(level="error"), shared)  # type: ignore[arg-type]
@@ -297,7 +297,7 @@ class Daemon:
 
     def obey(self, mark: tuple[int, int], resets: int) -> None:
         """Do as a driver that has found a request."""
-        entry = workcell_entry("pid 7: fire", stop=True, resets=resets, requests=[mark])
+        entry = workcell_entry("pid 7: fire", stop=True, resets=resets, requests=[mark], inode=self.request.inode)
         self.drivers_journal.append(entry, time.time())
         self.request.take(mark)
 
@@ -499,3 +499,13 @@ def test_no_reset_ends_what_a_driver_of_the_daemon_before_has_obeyed_just_now(
     assert bool(again.shared.latch.stopped_ns) is not is_heard
     again.reset()
     assert not again.stopped_by and not again.shared.latch.stopped_ns
+
+
+def test_what_drivers_note_late_of_the_daemons_own_file_stops_nobody_again(start: Callable[[], Daemon]) -> None:
+    """Two ask at the same time, their words not in their order; a driver that has read the first notes it last."""
+    daemon = start()
+    first = daemon.request.request(2000, PID, "fire")
+    daemon.request.request(1000, PID + 1, "smoke")
+    daemon.reset()
+    daemon.obey(first, 0)
+    assert not daemon.stopped_by and not daemon.shared.latch.stopped_ns
