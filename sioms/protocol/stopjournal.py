@@ -140,7 +140,7 @@ class Stopped:
         answered: marks of the stop-request file of which nobody asks for anything: that of the file there is first,
             as the last reset has answered it.
         requested: marks that drivers have obeyed and no reset is known to have answered. They say something where the
-            file is lost, or another daemon's: the daemon's own tells by itself what has been asked for.
+            file is lost, or another daemon's (``INODE``): the daemon's own tells by itself what has been asked for.
         requested_by: who has asked by the first of them, and requested_s: when that was noted [s since 1970].
     """
 
