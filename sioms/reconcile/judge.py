@@ -17,6 +17,7 @@ from sioms.reconcile.effects import known
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.free import Freely
 from sioms.reconcile.model import AxisModel
+from sioms.reconcile.resistance import resistance
 from sioms.reconcile.thresholds import (
     CLIPPED,
     FREE_FLOORS,
@@ -182,17 +183,7 @@ def power_given(problem: Problem, model: AxisModel) -> float:
         return 0.0
     places = np.quantile(np.concatenate([r.position for r in problem.session.records]), np.linspace(0.05, 0.95, PLACES))
     x, w = (a.ravel() for a in np.meshgrid(places, v, indexing="ij"))
-    still, level = np.zeros_like(x), np.zeros_like(x)
-    force = -model.viscous * w
-    for name, given in model.effects.items():
-        effect = known()[name]
-        if effect.slot is None or effect.slot is Slot.GAIN:
-            continue
-        row = effect.row(effect.values(given), model.pitch)
-        if effect.slot is Slot.FORCE:
-            force = force + effect.evaluate(x, w, still, still, row) - effect.evaluate(x, still, still, still, row)
-        else:
-            level = level + effect.evaluate(x, w, still, still, row)
-    power = ((force - np.sign(w) * np.maximum(level, 0.0)) * w).reshape(PLACES, -1).mean(axis=0)
+    still = np.zeros_like(x)
+    power = -(resistance(model, x, w, still, still) * np.abs(w)).reshape(PLACES, -1).mean(axis=0)
     power = power + power[::-1] if both else power
     return float(np.max(power) / (model.rated_force * np.max(np.abs(v))))

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.blocks import combined
-from sioms.reconcile.effect import Array, Slot
+from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known
 from sioms.reconcile.effects.smooth import LAWS
 from sioms.reconcile.engine.fit import Free, get, put
 from sioms.reconcile.fit import Fit, Problem, block_ids
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import physical
+from sioms.reconcile.resistance import resistance
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.simulate import Run
 
@@ -152,20 +153,7 @@ def dwelt(runs: Sequence[Run], spans: Sequence[slice]) -> list[Sample]:
 
 def opposing(model: AxisModel, s: Sample) -> float:
     """Return the mean force against the motion of a model in those states, [{F}]: all that leaves with the motion."""
-    still = np.zeros_like(s.v)
-    force = model.viscous * s.v
-    level = np.zeros_like(s.v)
-    for name, given in model.effects.items():
-        effect = known()[name]
-        if effect.slot is None or effect.slot is Slot.GAIN:
-            continue
-        row = effect.row(effect.values(given), model.pitch)
-        if effect.slot is Slot.FORCE:
-            force = force - effect.evaluate(s.x, s.v, s.u, s.temperature, row)
-            force = force + effect.evaluate(s.x, still, s.u, s.temperature, row)
-        else:
-            level = level + effect.evaluate(s.x, s.v, s.u, s.temperature, row)
-    return float(np.mean(force * np.sign(s.v) + np.maximum(level, 0.0)))
+    return float(np.mean(resistance(model, s.x, s.v, s.u, s.temperature)))
 
 
 def _slopes(model: AxisModel, free: Sequence[Free], s: Sample) -> NDArray[np.float64]:
