@@ -313,7 +313,8 @@ class NodeVerbs:
         """End the handles of clients that are stopped by a signal, or frozen: what they moved halts."""
         stopped = self._suspended.look(handle.session.peer.pid for handle in self.holders())
         for handle in [h for h in self.holders() if h.session.peer.pid in stopped]:
-            text = f"{handle.node.name}: its client was stopped, as by Ctrl-Z, or frozen; open it again"
+            who = "gateway" if handle.session.peer.key else "client"
+            text = f"{handle.node.name}: its {who} was stopped, as by Ctrl-Z, or frozen; open it again"
             if self._end(handle, errno.ETIMEDOUT, text):
                 self._cell.log("warning", "client stopped", node=handle.node.name, client=handle.session)
 

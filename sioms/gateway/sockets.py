@@ -7,8 +7,9 @@ import os
 import socket
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from mmap import PROT_READ, mmap
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Protocol, TypeVar
 
 from sioms.client.connecting import connect
 from sioms.protocol.journal import Event, JournalReader
@@ -19,6 +20,7 @@ from sioms.protocol.page import PageReader
 if TYPE_CHECKING:
     from _socket import socket as Socket
 
+T = TypeVar("T")
 MOST_QUEUED = MAX_WRITE + (1 << 20)
 """Bytes that wait for a driver that does not take them [one write of the largest size, and what is around it]."""
 _WAKES = 4096
@@ -32,6 +34,22 @@ class Watch(Protocol):
 
     def remove(self, fd: int) -> None:
         """Watch it no more."""
+
+
+def _received(receive: Callable[[], T]) -> T | None:
+    """Return what one call receives, None for the end. Of who has closed before reading everything, a reset is
+    reported once, ahead of the last word. Raises BlockingIOError: there is nothing yet.
+    """
+    for _ in range(2):
+        try:
+            return receive()
+        except ConnectionResetError:
+            continue
+        except BlockingIOError:
+            raise
+        except OSError:
+            break
+    return None
 
 
 class DaemonLine:
@@ -55,22 +73,23 @@ class DaemonLine:
 
     def _readable(self) -> None:
         fds: list[int] = []
+        space = socket.CMSG_SPACE(8 * 4)
         try:
-            packet, ancillary, _, _ = self._sock.recvmsg(MAX_PACKET, socket.CMSG_SPACE(8 * 4), socket.MSG_CMSG_CLOEXEC)
-            for level, kind, data in ancillary:
-                if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
-                    fds += memoryview(data[: len(data) - len(data) % 4]).cast("i")
+            found = _received(lambda: self._sock.recvmsg(MAX_PACKET, space, socket.MSG_CMSG_CLOEXEC))
         except BlockingIOError:
             return
-        except OSError:
-            packet = b""
+        packet, ancillary, _, _ = found or (b"", [], 0, None)
+        for level, kind, data in ancillary:
+            if (level, kind) == (socket.SOL_SOCKET, socket.SCM_RIGHTS):
+                fds += memoryview(data[: len(data) - len(data) % 4]).cast("i")
         if not packet:
             self._watch.remove(self._sock.fileno())
         self._packet(packet, fds)
 
     def send(self, packet: bytes) -> None:
-        """Send a packet."""
-        self._sock.send(packet)
+        """Send a packet; that a daemon has gone is noticed where its last word is read. Raises OSError."""
+        with suppress(ConnectionError):
+            self._sock.send(packet)
 
     def close(self) -> None:
         """Close it."""
@@ -112,12 +131,11 @@ class OpenNode:
     def _readable(self) -> None:
         if self._sock is None:
             return
+        sock = self._sock
         try:
-            packet = self._sock.recv(MAX_PACKET)
+            packet = _received(lambda: sock.recv(MAX_PACKET)) or b""
         except BlockingIOError:
             return
-        except OSError:
-            packet = b""
         self._packet(packet)
 
     def _woken(self) -> None:
@@ -130,7 +148,8 @@ class OpenNode:
 
     def send(self, packet: bytes) -> None:
         """Send a packet to the driver, as soon as it takes one, and take an answer that is there at once: a driver on
-        the same processor runs first. Raises OSError when it takes none for long.
+        the same processor runs first; one that has gone is noticed where its last word is read. Raises BlockingIOError
+        when it takes none for long.
         """
         if self._sock is None:
             return
@@ -139,6 +158,8 @@ class OpenNode:
                 self._sock.send(packet)
             except BlockingIOError:
                 self._watch.add(self._sock.fileno(), self._readable, self._writable)
+            except ConnectionError:
+                return
             else:
                 self._readable()
                 return

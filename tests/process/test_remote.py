@@ -7,6 +7,7 @@ import contextlib
 import errno
 import os
 import resource
+import signal
 import socket
 import subprocess
 import time
@@ -270,6 +271,23 @@ def test_a_revoked_key_is_out_at_once(daemon: Daemon, gate: Gateway, cell: sioms
             assert own is not None
             gate.keys.allow(gate.name, own.public, ("crew",))
             time.sleep(0.3)
+
+
+def test_who_was_halted_since_the_gateway_was_stopped_is_told_so(gate: Gateway, cell: sioms.Workcell) -> None:
+    """The driver's last word lies at the gateway behind what the client has sent meanwhile."""
+    with sioms.Workcell(gate.socket, "far") as far, far.open("mod1", "rw", lease=10.0) as arm:
+        os.kill(gate.process.pid, signal.SIGSTOP)
+        try:
+            for _ in range(3):
+                arm.keepalive()
+                time.sleep(0.05)
+            with cell.open("mod1", "rw", timeout=5.0):
+                pass
+        finally:
+            os.kill(gate.process.pid, signal.SIGCONT)
+        with raises(errno.ETIMEDOUT, "its gateway was stopped"):
+            while True:
+                arm.stop()
 
 
 def test_a_message_without_an_end_ends_its_connection_alone(remote: sioms.Workcell, gate: Gateway) -> None:
