@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     M = TypeVar("M", bound=Message)
 
 _DEPTH = 8
+_LONGEST_WHAT = 120
+_SECONDS = SECONDS.words.replace("nil", "None")
 _LEAST, _MOST = -(1 << 63), 1 << 64
 
 
@@ -96,9 +98,9 @@ def seconds(what: str, value: Any) -> float | None:
     """Return a time-out [s], None = for ever; raises TypeError or ValueError when it is none."""
     if value is None:
         return None
-    found = number(f"{what}: time-out", value, SECONDS.words)
+    found = number(f"{what}: time-out", value, _SECONDS)
     if found != found:
-        raise ValueError(f"{what}: time-out {found}; want {SECONDS.words}")
+        raise ValueError(f"{what}: time-out {found}; want {_SECONDS}")
     return found
 
 
@@ -135,11 +137,13 @@ def checked(what: str, message: M) -> M:
         ValueError: no message holds it.
     """
     taken: list[Any] = []
-    for value, kind in zip(message, message.fields.values(), strict=True):
+    verb = what if len(what) <= _LONGEST_WHAT else f"{what[:_LONGEST_WHAT]}..."
+    for value, (name, kind) in zip(message, message.fields.items(), strict=True):
+        what = f"{verb}: {name.removesuffix('_s').replace('_', ' ')}"
         if kind is INTEGER:
             value = value if type(value) is int and 0 <= value < _MOST else integer(what, value)
         elif kind is SECONDS:
-            value = seconds(what, value)
+            value = seconds(verb, value)
         elif kind is NUMBER:
             value = number(what, value)
         elif kind is ANYTHING:
