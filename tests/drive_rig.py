@@ -77,9 +77,8 @@ class Joined:
     def wait(self, seconds: float, look: Callable[[], object] = lambda: None) -> None:
         """Let time pass, and look at each millisecond."""
         for _ in range(round(seconds * 1000)):
-            self.now_s += 0.001
-            self.device.due()
-            look()
+            if said := self.go_on(look):
+                self._hear(said)
 
     def do(self, steps: Steps, look: Callable[[], object] = lambda: None) -> None:
         """Carry out a hook as the kit does; characters take their time."""
@@ -95,14 +94,31 @@ class Joined:
         reply = b"".join(self.device.take(step.data))
         self.wait(len(reply) * CHARACTER_S, look)
         if isinstance(step, Exchange):
-            return self._decoded(step, reply)
-        if self._overheard is not None and reply:
-            self._overheard(reply, round(self.now_s * 1e9))
+            return self._decoded(step, reply, look)
+        if reply:
+            self._hear(reply)
         return None
 
-    def _decoded(self, exchange: Any, reply: bytes) -> Any:
-        size = exchange.want(reply)
-        if size is None or size > len(reply):
-            self.wait(exchange.timeout_s + self._recovery_s)
-            raise LinkError("no reply")
+    def go_on(self, look: Callable[[], object] = lambda: None) -> bytes:
+        """Let a millisecond pass; return what the device says unasked."""
+        self.now_s += 0.001
+        said = b"".join(self.device.due() or ())
+        look()
+        return said
+
+    def _hear(self, said: bytes) -> None:
+        if self._overheard is not None:
+            self._overheard(said, round(self.now_s * 1e9))
+
+    def _decoded(self, exchange: Any, reply: bytes, look: Callable[[], object]) -> Any:
+        until_s = self.now_s + exchange.timeout_s
+        while (size := exchange.want(reply)) is None or size > len(reply):
+            if self.now_s >= until_s:
+                if reply:
+                    self._hear(reply)
+                self.wait(self._recovery_s)
+                raise LinkError("no reply")
+            reply += self.go_on(look)
+        if rest := reply[size:]:
+            self._hear(rest)
         return exchange.decode(reply[:size])

@@ -82,6 +82,12 @@ POSITION_KEPT = (2, 4, 5)
 DEAF = (1, 2)
 """Alarms after which the controller hears nothing but a reset, not even ``?``."""
 
+RESETTING = (3, 6, 7, 8, 9)
+"""Alarms behind which it resets itself and greets: resets in motion and homings that failed."""
+
+ALARM_S = 0.6
+"""After an alarm it hears nothing for half a second, no reset either (``report_alarm_message``)."""
+
 
 def alarm_text(number: int) -> str:
     """Return an alarm in words.
@@ -141,8 +147,15 @@ class Answer:
 
 
 def alarm_of(lines: Iterable[str]) -> int:
-    """Return the number of the last ``ALARM:n`` among lines, 0 when there is none."""
-    numbers = [int(line[6:]) for line in lines if re.fullmatch(r"ALARM:\d+", line)]
+    """Return the number of the last ``ALARM:n`` among lines, 0 when there is none.
+
+    What was heard between two exchanges may begin with a piece of a line the rest of which a reply has taken.
+
+    Example:
+        >>> alarm_of(["ok", "[MSG:'$HALARM:1"])
+        1
+    """
+    numbers = [int(found[1]) for line in lines if (found := re.search(r"ALARM:(\d+)$", line))]
     return numbers[-1] if numbers else 0
 
 

@@ -3,16 +3,18 @@
 Behaves as the sources of Grbl 1.1h say (gnea/grbl, v1.1h.20190825, 40eb439b;
 ``grbl/{main,protocol,serial,system,motion_control}.c``): one ``ok`` or ``error:N`` a line, real-time bytes, a planner
 that looks ahead over 15 blocks and lets a line wait for its ``ok`` when it is full (a jog cancel empties it, and the
-line that waited goes out after it), holds, alarms of which 1 and 2 leave it deaf until a reset, homing during which
-``?`` is ignored, a position that is wrong after a reset in motion and 0 after the supply was off. Commands on standard
-input, beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``, ``program DISTANCE
-FEED`` (somebody else's move in X), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND
-VALUE`` (velocity: a jog in X; position; mode: a G word).
+line that waited goes out after it), holds, alarms with half a second in which nothing is heard, of which 1 and 2 leave
+it deaf until a reset after that, homing (``simulated.homing``), whose end answers all ``?`` of its time with one
+``<Home``, a position that is wrong after a reset in motion and 0 after the supply was off. Commands on standard input,
+beside those of the line: ``state``, ``alarm N`` (motion ends, position lost), ``door``, ``program DISTANCE FEED``
+(somebody else's move in X), ``power_cycle [SECONDS]``, ``refuse COUNT``, ``freeze [COUNT]``, ``foreign KIND VALUE``
+(velocity: a jog in X; position; mode: a G word), ``reference [off]`` (the switches are 5 mm away, or nowhere).
 """
 
 from __future__ import annotations
 
 import asyncio
+import math
 import re
 import time
 from collections import deque
@@ -22,15 +24,21 @@ from sioms.simulation import wire
 from sioms.simulation.drive import Stepper
 
 from .simulated.gcode import Parser
+from .simulated.homing import Homing
 from .simulated.planner import BLOCKS, Planner
 
 RX_BYTES = 128
 LINE_BYTES = 80
 CRITICAL = (1, 2)
 """Alarms that wait for a reset: nothing else is heard meanwhile, not even ``?``."""
+RESETTING = (3, 6, 7, 8, 9)
+"""Alarms that end with a reset of its own."""
+ALARM_S = 0.5
+"""How long it hears nothing once it has told an alarm (``report_alarm_message``)."""
 FACTORY = {10: 1, 110: 500, 120: 10}
 """Mask of the reports, speeds [mm/min] and accelerations [mm/s^2] of ``defaults.h``, DEFAULTS_GENERIC."""
 FOREVER = 1 << 30
+NEAR_MM = 5.0
 REALTIME = set(b"?!~\x18\x84\x85") | set(range(0x90, 0xA2))
 
 
@@ -43,6 +51,7 @@ class Controller:
         hal: bool = False,
         homing: bool = True,
         factory: bool = False,
+        locked: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.letters = "XYZABCUVW"[:axes]
@@ -77,47 +86,64 @@ class Controller:
             for key, value in FACTORY.items():
                 self.settings |= {key + i: value for i in range(axes if key > 100 else 1)}
         self.planner = Planner(axes, self.settings, self._admit)
-        self.state = "Alarm" if homing else "Idle"
+        self.homing = Homing(self.planner, self.settings)
+        self._locked = homing if locked is None else locked
+        self.state = "Alarm" if self._locked else "Idle"
         self.parser = Parser(self.letters)
         self.reports = 0
         self._line = bytearray()
         self._lines: deque[str] = deque()
         self._pending: list[bytes] = []
-        self._homing_s = 0.0
         self._clock = clock
-        self._off_until_s = 0.0
-        self._deaf = False
+        self._off_until_s = self._mute_until_s = 0.0
+        self._deaf = self._asked = False
+        self._then: Callable[[], None] = self._greet
         self._refusals = self._frozen = 0
         self._image = ""
-        self.time = Stepper(self._step, lambda: not self.planner.blocks and not self._homing_s, clock)
+        self.time = Stepper(self._step, lambda: not self.planner.blocks and not self.homing.is_on, clock)
 
     # -- motion ----------------------------------------------------------------------------------
 
     def _step(self, now_s: float, dt: float) -> None:
-        if self._homing_s:
-            if now_s >= self._homing_s:
-                self._end_homing()
+        if self.homing.is_on:
+            alarm = self.homing.step(dt)
+            if alarm is not None:
+                self._end_homing(alarm)
         elif self.state not in ("Alarm", "Sleep") and self.planner.step(dt) and self.state in ("Run", "Jog"):
             self.state = "Idle"
 
-    def _end_homing(self) -> None:
-        self._homing_s = 0.0
-        axes = len(self.letters)
-        self.planner.position, self.planner.slip = [-self.settings[27]] * axes, [0.0] * axes
-        self.state = "Idle"
+    def _end_homing(self, alarm: int) -> None:
+        if alarm:
+            self.crash(alarm)
+            return
+        if self._asked:  # answered once, before the state changes
+            self._say(self.report())
+        self.state, self._asked = "Idle", False
         self._say("ok")
         self._admit()
 
     def crash(self, number: int) -> None:
-        """End all motion at once, in alarm."""
+        """End all motion at once, in alarm; nothing is heard for a time, and some alarms reset it then."""
         self.planner.end_at_once()
         self._lines.clear()
-        self._homing_s = 0.0
-        self.state = "Alarm"
+        self.homing.end()
+        self.state, self._asked = "Alarm", False
         self._say(f"ALARM:{number}")
         if number in CRITICAL:
-            self._say("[MSG:Reset to continue]")
+            self._hush(lambda: self._say("[MSG:Reset to continue]"))
             self._deaf = True
+        elif number in RESETTING:
+            self._hush(self._start_anew)
+
+    def _hush(self, then: Callable[[], None]) -> None:
+        self._mute_until_s, self._then = self._clock() + ALARM_S, then
+
+    def _is_mute(self) -> bool:
+        """Tell whether it waits for an alarm to have been sent, and hears nothing; go on when it has waited."""
+        if self._mute_until_s and self.time.catch_up() >= self._mute_until_s:
+            self._mute_until_s = 0.0
+            self._then()
+        return self._mute_until_s > 0
 
     def power_cycle(self, seconds: str = "0.2") -> None:
         """Take the supply away for a time: the motors stop where they are, and nothing is heard or said."""
@@ -133,9 +159,10 @@ class Controller:
             planner = self.planner
             planner.slip = [s + p for s, p in zip(planner.slip, planner.position, strict=True)]
             planner.position = [0.0] * len(planner.position)
-            self._homing_s, self._deaf = 0.0, False
-            self.state = "Alarm" if self.settings[22] else "Idle"
-            self._reset()
+            self.homing.end()
+            self._mute_until_s, self._deaf, self._asked = 0.0, False, False
+            self.state = "Alarm" if self._locked else "Idle"
+            self._start_anew()
         return self._off_until_s > 0
 
     # -- line ------------------------------------------------------------------------------------
@@ -154,15 +181,15 @@ class Controller:
 
     def due(self) -> list[bytes]:
         """Let time pass."""
-        if self._is_off():
-            return []
+        if self._is_off() or self._is_mute():
+            return self._spoken()
         self._admit()
         return self._spoken()
 
     def take(self, data: bytes) -> list[bytes]:
         """Take bytes: real-time ones at once, the rest by lines that end in LF or CR."""
-        if self._is_off():
-            return []
+        if self._is_off() or self._is_mute():
+            return self._spoken()
         for byte in data:
             if byte in REALTIME or (self.hal and byte in (0x80, 0x81, 0x82, 0x83, 0x87, 0x19)):
                 self._realtime(byte)
@@ -178,14 +205,14 @@ class Controller:
 
     def _admit(self) -> None:
         """Take lines while the planner has room; a full one lets the line wait for its ok."""
-        while self._lines and len(self.planner.blocks) < BLOCKS and not self._homing_s and not self._deaf:
+        while self._lines and len(self.planner.blocks) < BLOCKS and not self.homing.is_on and not self._deaf:
             line = self._lines.popleft()
             if self._refusals > 0 and line:
                 self._refusals -= 1
                 error = 8
             else:
                 error = self._obey(line) if len(line) < LINE_BYTES else 11
-            if not self._homing_s or error:
+            if not self.homing.is_on or error:
                 self._say(f"error:{error}" if error else "ok")
 
     def _greet(self) -> None:
@@ -196,7 +223,9 @@ class Controller:
 
     def _realtime(self, byte: int) -> None:
         match byte:
-            case 0x3F | 0x80 if not self._homing_s and not self._deaf:
+            case 0x3F | 0x80 if self.homing.is_on and not self.hal:
+                self._asked = True
+            case 0x3F | 0x80 if not self._deaf:
                 self._frozen -= self._frozen > 0
                 self._image = self._image if self._frozen and self._image else self.report()
                 self._say(self._image)
@@ -216,12 +245,15 @@ class Controller:
                 self.planner.holding, self.state = True, "Door"
 
     def _reset(self) -> None:
-        if self._homing_s:
+        if self.homing.is_on:
             self.crash(6)
         elif self.planner.speed > 0:
             self.crash(3)
         else:
-            self.state = "Alarm" if self.state in ("Alarm", "Sleep") else "Idle"
+            self._start_anew()
+
+    def _start_anew(self) -> None:
+        self.state = "Alarm" if self.state in ("Alarm", "Sleep") else "Idle"
         self._deaf = False
         self.planner.clear()
         self._lines.clear()
@@ -295,8 +327,7 @@ class Controller:
                 if not self.settings[22]:
                     return 5
                 self.state = "Home"
-                way = max(abs(p) for p in self.planner.position) + 10
-                self._homing_s = self._clock() + way / (self.settings[25] / 60) + 0.3
+                self.homing.begin()
             case "$SLP":
                 self.state = "Sleep"
             case _:
@@ -363,6 +394,10 @@ class Controller:
         def setting(key: str, value: str) -> None:
             self.settings[int(key)] = float(value)
 
+        def reference(where: str = "") -> None:
+            self.time.catch_up()
+            self.homing.put_near(math.inf if where == "off" else NEAR_MM)
+
         def refuse(count: str) -> None:
             self._refusals = int(count)
 
@@ -371,7 +406,7 @@ class Controller:
 
         return {
             "state": state, "alarm": alarm, "program": program, "set": setting, "power_cycle": self.power_cycle,
-            "refuse": refuse, "freeze": freeze, "foreign": self.foreign,
+            "refuse": refuse, "freeze": freeze, "foreign": self.foreign, "reference": reference,
             "door": lambda: self._realtime(0x84), "hold": lambda: self._realtime(0x21),
         }  # fmt: skip
 
@@ -388,9 +423,12 @@ async def main() -> None:
     parser.add_argument("--axes", type=int, default=3)
     parser.add_argument("--hal", action="store_true", help="grblHAL")
     parser.add_argument("--no-homing", action="store_true", help="$22=0: starts unlocked")
+    parser.add_argument("--unlocked", action="store_true", help="built without HOMING_INIT_LOCK: starts unlocked")
     parser.add_argument("--factory", action="store_true", help="$10, $110.. and $120.. as Grbl ships")
     options = parser.parse_args()
-    controller = Controller(options.axes, options.hal, not options.no_homing, options.factory)
+    homing = not options.no_homing
+    locked = homing and not options.unlocked
+    controller = Controller(options.axes, options.hal, homing, options.factory, locked)
     await wire.run(controller, options, controller.handlers())
 
 

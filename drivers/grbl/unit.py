@@ -133,7 +133,8 @@ class GrblUnit(AxesUnit):
         self._replaces = [False] * n
         self._clean = self._restarted = self._deaf = False
         """Nothing was started since all were stopped; the controller has greeted; it waits for a reset."""
-        self._reset_ns = 0
+        self._reset_ns = self._silent_until_ns = self._greets_until_ns = 0
+        """Last reset of ours; until when it hears nothing behind an alarm, and a greeting is of that alarm's reset."""
 
     # --- hooks ----------------------------------------------------------------------------------
 
@@ -180,6 +181,9 @@ class GrblUnit(AxesUnit):
                 report, _ = yield grbl.status(STATUS_S)
                 self._raw = self._positions(report)
             self._report_homing()
+            return
+        if self._is_silent():
+            self._tell_alarm()
             return
         if self._deaf:
             yield from self._reset_now()
@@ -247,8 +251,8 @@ class GrblUnit(AxesUnit):
             yield self._cancel()
             return
         self._forget()
-        if self._clean:
-            return  # nothing was started since all axes were stopped for another one
+        if self._clean or self._is_silent():
+            return  # nothing was started since all axes were stopped for another one, or an alarm has ended it
         rests = False
         if not self._homing.is_on and self._settings.quick_stop != "reset":
             rests = yield from grbl_opening.brake(self.clock, self._take_heard, self._braking_s())
@@ -262,12 +266,14 @@ class GrblUnit(AxesUnit):
 
     def _reset_now(self) -> Steps:
         was = self._state
+        if self._is_silent():
+            yield Pause((self._silent_until_ns - self.clock()) / 1e9)
         self._reset_ns = self.clock()
         lines = yield grbl.reset(RESET_S)
         self._reset_ns = self.clock()
         self._homing.forget()
         self._hear(lines)
-        self._deaf = False
+        self._deaf, self._silent_until_ns = False, 0
         if was in ("Jog", "Run", "Home"):
             self._lose_places(grbl.alarm_text(3))
 
@@ -282,7 +288,7 @@ class GrblUnit(AxesUnit):
         if self._homing.is_on:
             return
         self._homing.begin(self.clock())
-        self._clean, self._seen = False, None
+        self._clean, self._seen, self._rest = False, None, b""  # the rest of a cut line was in a reply
         for each in range(self.bank.n):
             self._moves.drop(each)
         yield Send(b"$H\n", "home all axes")
@@ -290,6 +296,8 @@ class GrblUnit(AxesUnit):
     def reset(self, axis: int) -> Steps:
         """Unlock the controller; a critical alarm needs a reset before."""
         state = "Alarm"
+        if self._is_silent():
+            yield Pause((self._silent_until_ns - self.clock()) / 1e9)
         try:
             report, lines = yield grbl.status(TIMEOUT_S)
         except LinkError:  # some alarms wait for a reset, and hear nothing else
@@ -309,6 +317,8 @@ class GrblUnit(AxesUnit):
         lines = grbl.lines_of(self._rest)
         self._rest = self._rest[self._rest.rfind(b"\n") + 1 :][-grbl.LINE_LIMIT :]
         self._hear(lines)
+        if grbl.alarm_of(lines):
+            self._silent_until_ns = self.clock() + int(grbl.ALARM_S * 1e9)
         self._listen(lines)
         if self._homing.is_on:  # told to the bank by the next poll, which publishes it
             self._homing.hear(lines, self._alarm)
@@ -347,8 +357,21 @@ class GrblUnit(AxesUnit):
         number = grbl.alarm_of(lines)
         if number:
             self._alarm, self._deaf = number, number in grbl.DEAF
+            until_ns = self.clock() + int(grbl.ALARM_S * 1e9)
+            self._greets_until_ns = until_ns + OWN_RESET_NS if number in grbl.RESETTING else 0
             if number not in grbl.POSITION_KEPT:
                 self._lose_places(grbl.alarm_text(number))
+
+    def _is_silent(self) -> bool:
+        """Tell whether it tells an alarm, and hears nothing meanwhile."""
+        return self.clock() < self._silent_until_ns
+
+    def _tell_alarm(self) -> None:
+        """Tell the bank of an alarm where the controller cannot be asked: moving until it has told where it stands."""
+        n, rows = self.bank.n, self.bank.rows
+        self.report(
+            self._raw, np.zeros(n), rows["in_motion"] > 0, np.zeros(n, bool), [grbl.alarm_text(self._alarm)] * n
+        )
 
     def _listen(self, lines: Sequence[str]) -> None:
         """Hear that the controller has started anew; not of the greeting that a reset of ours has brought."""
@@ -359,7 +382,7 @@ class GrblUnit(AxesUnit):
         """Note that it has greeted: the next poll tells; not of the second greeting that a reset of
         ours has brought.
         """
-        if self.clock() - self._reset_ns > OWN_RESET_NS:
+        if self.clock() - self._reset_ns > OWN_RESET_NS and self.clock() > self._greets_until_ns:
             self._restarted = True
 
     def _noting_restart(self, steps: Steps) -> Steps:

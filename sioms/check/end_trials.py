@@ -13,7 +13,7 @@ from typing import Any
 from sioms.protocol.flags import AxisStatus
 
 from .device import place_of
-from .motion_trials import REST_S, SLOW, STILL_S, forward, run, send_home, wait_moving
+from .motion_trials import REST_S, SLOW, STILL_S, begin_homing, find_again, forward, run, wait_moving
 from .rigs import Axis
 from .station import Station
 from .trial import Failed, NotApplicable, Trial
@@ -29,6 +29,7 @@ def ends(station: Station, full: bool) -> str:
     axis = station.rig.axes[0]
     texts = []
     with station.cell.open(axis.node, "rw", timeout=5.0) as node:
+        find_again(node)
         for name, do in ENDS.items():
             for _ in range(3 if full else 1):
                 node.wait_until_idle(REST_S)
@@ -82,8 +83,7 @@ def _stop(station: Station, node: Any, axis: Axis) -> float:
 
 
 def _home(station: Station, node: Any, axis: Axis) -> float:
-    send_home(station, node)
-    fast = wait_moving(station, node.read, axis)
+    fast = begin_homing(station, node, axis)  # not every device tells its place meanwhile
     node.wait_until_idle(HOMING_S)
     return fast
 

@@ -150,7 +150,8 @@ def send_home(station: Station, node: Any) -> None:
         raise NotApplicable(f"it does not home: {error.strerror}") from None
 
 
-def _homing(station: Station, node: Any, axis: Axis) -> float:
+def begin_homing(station: Station, node: Any, axis: Axis) -> float:
+    """Begin a homing; return how fast the device is while it searches."""
     send_home(station, node)
     if not wait_for(lambda: node.read().in_motion[0], 3.0):
         raise NotApplicable("its homing ended at once")
@@ -175,7 +176,7 @@ def _idle(station: Station, node: Any, axis: Axis) -> float:
 
 STATES: dict[str, Callable[[Station, Any, Axis], float]] = {
     "idle": _idle, "running": _in_motion, "moving": _in_move, "buffered": _buffered, "at a marker": _at_marker,
-    "at a synch": _at_synch, "homing": _homing, "pushing": _pushing,
+    "at a synch": _at_synch, "homing": begin_homing, "pushing": _pushing,
 }  # fmt: skip
 WAYS = ("stop", "emergency stop", "close")
 QUICK = {
@@ -211,6 +212,7 @@ def _stop(station: Station, state: str, way: str) -> float:
     with station.cell.open(f"{axis.node}.readonly") as seen:
         node = station.cell.open(axis.node, "rw", timeout=5.0)
         try:
+            find_again(node)
             node.wait_until_idle(REST_S)
             fast = STATES[state](station, node, axis)
             if way == "stop":
@@ -232,6 +234,14 @@ def _stop(station: Station, state: str, way: str) -> float:
         finally:
             with contextlib.suppress(OSError):
                 node.close()
+
+
+def find_again(node: Any) -> None:
+    """Say where an axis is if its place is lost, as that of some is when a stop ends their homing."""
+    seen = node.read()
+    if seen.status[0] & AxisStatus.POSITION_LOST:
+        node.reset()
+        node.calibrate(seen.position[0])
 
 
 def _check_latch(station: Station, node: Any, axis: Axis, way: str) -> None:

@@ -271,6 +271,8 @@ class Line:
                 what = step.what if isinstance(step, Exchange) else "exchange"
                 heard = len(running.reply)
                 got = f"{heard} bytes and no whole reply" if heard else "no reply"
+                if heard and self._unsolicited is not None:  # what it has said unasked, instead of a reply
+                    self._unsolicited(bytes(running.reply), now_ns)
                 self._recover(f"{what}: {got} within its time-out", now_ns, heard=heard > 0)
             case _State.RECOVERING:
                 quiet_ns = self._quiet_since_ns + self._recovery_ns

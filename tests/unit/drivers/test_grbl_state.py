@@ -245,7 +245,8 @@ def test_a_supply_off_behind_a_lost_link_loses_the_place(homing: bool, place_mm:
         with pytest.raises(LinkError):
             rig.do(rig.unit.poll())
         rig.wait(0.1)
-    rig.wait(1.5)
+    for _ in range(1500):  # nobody hears its greeting
+        rig.go_on()
     rig.do(rig.unit.open())
     # at 0, and not locked: nothing that it says without its greeting differs
     told = homing or place_mm != 0
@@ -342,3 +343,108 @@ def test_the_example_of_its_page_fits_a_controller_as_it_ships() -> None:
     jog(rig, -0.008)
     poll(rig, 25)
     assert rig.device.planner.speed == pytest.approx(8.0)
+
+
+def homed() -> tuple[Joined, grbl.Controller]:
+    """Return one that may home and is not locked."""
+    keys = {"axis": [AXIS], "homing": True, "homing_timeout_s": 60.0}
+    rig = Joined(Grbl, keys, lambda clock: grbl.Controller(1, clock=clock))
+    device = rig.device
+    rig.do(rig.unit.open())
+    poll(rig, 3)
+    rig.unit.bank.reset(np.array([0]))
+    rig.do(rig.unit.reset(0))
+    poll(rig, 3)
+    assert device.state == "Idle"
+    return rig, device
+
+
+def search(rig: Joined) -> None:
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig.poll(2)
+
+
+def test_a_homing_moves_the_machine_and_ends_at_the_switch() -> None:
+    rig, device = homed()
+    search(rig)
+    speeds = []
+    for _ in range(170):
+        rig.poll(1, 0.02)
+        speeds.append(device.planner.speed)
+        if device.homing.is_on:
+            assert rig.unit.bank.rows["in_motion"][0]
+            rig.device.take(b"?")  # answered at its end, with Home and before its ok
+    assert max(speeds) > 20 and 0 < min(s for s in speeds if s) < 2
+    assert not rig.unit.bank.rows["in_motion"][0] and rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
+    assert rig.unit.bank.rows["position"][0] == pytest.approx(-0.001) and not rig.unit.bank.is_in_fault(0)
+    assert device.planner.position[0] + device.planner.slip[0] == pytest.approx(10.0 - 1.0, abs=0.01)
+
+
+def test_a_homing_that_finds_no_switch_is_a_fault_that_says_so() -> None:
+    rig, device = homed()
+    device.settings[130] = 20.0  # it looks one and a half times as far
+    device.handlers()["reference"]("off")
+    search(rig)
+    rig.poll(150)
+    assert rig.unit.bank.is_in_fault(0) and "ALARM:9" in rig.unit.bank.fault_text(0)
+    assert lost(rig) and not rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
+    rig.unit.bank.reset([0])
+    rig.do(rig.unit.reset(0))
+    rig.poll(5)
+    assert device.state == "Idle" and lost(rig)
+
+
+def test_a_homing_that_is_stopped_ends_at_once_and_loses_the_place() -> None:
+    rig, device = homed()
+    search(rig)
+    rig.poll(10)
+    assert device.planner.speed > 20
+    rig.unit.bank.emergency_stop([0], rig.unit.clock())
+    rig._act()
+    assert device.planner.speed == 0
+    rig.poll(60)
+    place = device.planner.position[0] + device.planner.slip[0]
+    assert lost(rig) and not rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
+    rig.poll(20)
+    assert device.planner.position[0] + device.planner.slip[0] == place and device.state == "Alarm"
+
+
+@pytest.mark.parametrize("at_ms", range(0, 44, 4))
+def test_an_alarm_is_told_while_the_controller_hears_nothing(at_ms: int) -> None:
+    rig, device = opened()
+    jog(rig, 0.05)
+    rig.poll(10)
+    rig.wait(at_ms / 1000)
+    device.crash(1)
+    good_s = rig.now_s
+    for _ in range(20):
+        try:
+            rig.poll(1, 0.04)
+        except LinkError:  # the alarm came instead of its reply
+            continue
+        assert rig.now_s - good_s < 0.5, "that would be a lost link"
+        good_s = rig.now_s
+    assert rig.unit.bank.is_in_fault(0) and "ALARM:1, hard limit" in rig.unit.bank.fault_text(0)
+    rig.unit.bank.reset([0])
+    rig.do(rig.unit.reset(0))  # at once: what is sent within half a second of the alarm is dropped
+    rig.poll(5)
+    assert device.state == "Idle" and lost(rig)
+
+
+def test_a_homing_after_one_that_was_stopped_ends_homed() -> None:
+    rig, _ = homed()
+    search(rig)
+    rig.poll(10)
+    rig.unit.bank.stop([0], rig.unit.clock())
+    rig._act()
+    rig.poll(60)
+    rig.unit.bank.reset([0])
+    rig.do(rig.unit.reset(0))
+    rig.poll(5)
+    rig.unit.bank.calibrate([0], [0.0])
+    rig.poll(5)
+    rig.unit.overhear(b"[MSG:'", rig.unit.clock())  # of a line the rest of which was in a reply
+    search(rig)
+    rig.poll(170)
+    assert not rig.unit.bank.is_in_fault(0), rig.unit.bank.fault_text(0)
+    assert not rig.unit.bank.rows["in_motion"][0] and rig.unit.bank.rows["status"][0] & AxisStatus.HOMED
