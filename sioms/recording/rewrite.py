@@ -18,6 +18,8 @@ from .reader import Piece, Recording
 LIBRARY = "sioms"
 CHUNK = 4 << 20
 """Bytes of a chunk before it is packed."""
+PACKING = ".packing"
+"""Added to the name of a file until it is whole."""
 
 
 @dataclass(slots=True)
@@ -147,7 +149,7 @@ def rewrite(
         OSError: a source cannot be read, or the target cannot be written.
     """
     lost: list[str] = []
-    half = f"{target}.packing"
+    half = f"{target}{PACKING}"
     try:
         with open(half, "wb") as file:
             out = PackedFile(file)

@@ -17,7 +17,7 @@ from sioms.client.workcell import Workcell
 from sioms.documents import json_text
 from sioms.ending import on_end
 from sioms.prompt import be_prompt
-from sioms.recording.live.box import KEPT_S, Box
+from sioms.recording.live.box import KEPT_S, Box, clear_up
 from sioms.recording.live.recorder import Recorder
 from sioms.recording.reader import Recording
 from sioms.recording.story import happened, sentence, tell, utc
@@ -107,6 +107,7 @@ def _keep(folder: Path, memory: int, seconds: float) -> int:
     if not _lock(folder):
         text = f"keep boxes in {folder}: another keeper is at work there; name another folder, or end that one"
         raise OSError(errno.EBUSY, text)
+    clear_up(folder)
     ended = False
 
     def end() -> None:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from sioms.recording import mcap
 from sioms.recording.messages import Event
-from sioms.recording.rewrite import LIBRARY, rewrite
+from sioms.recording.rewrite import LIBRARY, PACKING, rewrite
 from sioms.recording.story import weight
 
 KEPT_S, PIECE_S = 60.0, 1.0
@@ -22,6 +22,20 @@ AFTER_S, REST_S = 2.0, 10.0
 """How long after its cause a box is written, and how long after that the next one at the earliest [s]."""
 FILES = 50
 """Boxes that are kept in a folder."""
+PART = ".part"
+"""Suffix of a box that is not whole yet."""
+
+
+def clear_up(folder: Path) -> None:
+    """Make boxes of what a keeper left that ended while it wrote; raises OSError.
+
+    Args:
+        folder: no keeper is at work there.
+    """
+    for left in folder.glob(f"*{PART}"):
+        os.replace(left, left.with_suffix(".mcap"))  # reading it tells what is missing
+    for left in folder.glob(f"*.mcap{PACKING}"):
+        left.unlink()
 
 
 class Box:
@@ -107,7 +121,7 @@ class Box:
         return self._folder / f"{time.strftime('%Y%m%dT%H%M%SZ', time.gmtime())}-{name}.mcap"
 
     def _write(self) -> None:
-        """Write aside, in a process that shares the memory: recording goes on meanwhile."""
+        """Write in another process, which shares the memory: recording goes on meanwhile."""
         path = self.path()
         pid = os.fork()
         if pid:
@@ -115,30 +129,35 @@ class Box:
             return
         status = 1
         try:
-            with suppress(OSError):
-                os.nice(19)
             self.save(path)
             for old in sorted(self._folder.glob("*.mcap"))[:-FILES]:
                 old.unlink()
             status = 0
+            os.nice(19)
+            rewrite([str(path)], str(path))  # in no hurry, and without it the box is whole
         except OSError as error:
-            print(f"sioms blackbox: write {path}: {error.strerror or error}; it is lost", file=sys.stderr, flush=True)
+            if status:
+                print(
+                    f"sioms blackbox: write {path}: {error.strerror or error}; it is lost", file=sys.stderr, flush=True
+                )
         finally:
             os._exit(status)
 
     def save(self, path: Path) -> None:
-        """Write what is kept to a file.
+        """Write what is kept to a file, as a live recording; it appears when it is whole and on the disk.
 
         Raises:
             OSError: it cannot be written.
         """
-        live = path.with_suffix(".part")
+        live = path.with_suffix(PART)
         try:
             with open(live, "wb") as file:
                 file.write(mcap.header(LIBRARY) + mcap.metadata("blackbox", {"why": self._why}) + self._definitions)
                 for _, piece in self._pieces:
                     file.write(_unpacked(piece))
-            rewrite([str(live)], str(path))
+                file.flush()
+                os.fsync(file.fileno())
+            os.replace(live, path)
         finally:
             live.unlink(missing_ok=True)
 
