@@ -19,7 +19,9 @@ from sioms.recording.messages import Event
 from sioms.recording.reader import Recording
 from sioms.recording.rewrite import rewrite
 from sioms.recording.story import happened, sentence, utc
-from sioms.recording.tables import head_of, main_column, of_events, of_table
+from sioms.recording.tables import of_events, of_table
+
+from .picture import draw
 
 PICTURES = (".png", ".svg", ".pdf")
 
@@ -34,7 +36,7 @@ def add_parser(subparsers: Any) -> None:
     one.add_argument("--json", action="store_true", help="print JSON")
     one = actions.add_parser("plot", help="plot nodes over time")
     one.add_argument("file", metavar="FILE")
-    one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all)")
+    one.add_argument("nodes", metavar="NODE", nargs="*", help="nodes (default: all that change)")
     one.add_argument("-c", "--column", default="", help="e.g. velocity (default: position of axes, data of others)")
     one.add_argument("-o", "--output", metavar="PICTURE", required=True, help="PNG, SVG or PDF to write")
     _add_span(one)
@@ -191,33 +193,10 @@ def _gaps(events: Iterable[Event]) -> dict[str, int]:
 
 
 def _plot(args: argparse.Namespace) -> list[str]:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     picture = _fresh(args.output, PICTURES)
     with Recording(args.file) as recording:
-        names: Iterable[str] = args.nodes or recording.nodes
-        nodes = [recording.node(name) for name in names]
-        if not nodes:
+        if not recording.nodes:
             raise OSError(errno.EINVAL, f"plot {args.file}: no nodes are recorded")
         start, end = (each - recording.offset_ns for each in _span(recording, args))
-        figure = Figure(figsize=(10, 1 + 2.2 * len(nodes)), layout="constrained")
-        FigureCanvasAgg(figure)
-        axes = figure.subplots(len(nodes), 1, sharex=True, squeeze=False)[:, 0]
-        zero: int | None = None
-        for axis, node in zip(axes, nodes, strict=True):
-            column = args.column or main_column(node.info)
-            table = recording.table(node.info.name, [column], start, end)
-            zero = int(table.stamps_ns[0]) if zero is None and len(table.stamps_ns) else zero
-            for channel in range(len(node.info.channels)):
-                label = head_of(node.info, channel, column)
-                axis.plot((table.stamps_ns - (zero or 0)) / 1e9, table.values[column][:, channel], label=label, lw=0.8)
-            axis.set_title(node.info.name, loc="left")
-            axis.legend(loc="upper right", fontsize=6)
-        for event in recording.events():
-            if event.kind in ("stop", "fault") and zero is not None and start <= event.stamp_ns < end:
-                for axis in axes:
-                    axis.axvline((event.stamp_ns - zero) / 1e9, color="red", lw=0.6)
-        axes[-1].set_xlabel("time [s]")
-        figure.savefig(picture)
+        draw(recording, args.nodes, args.column, start, end).savefig(picture)
         return list(recording.damage)
