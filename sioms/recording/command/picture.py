@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,7 +79,7 @@ def draw(recording: Recording, nodes: Sequence[str], column: str | None, start_n
     text = told + [f"unchanged: {', '.join(still)}"] * bool(still)
     figure = Figure(figsize=(10, 1.2 + 2.0 * len(drawn) + 0.2 * len(text)), layout="constrained")
     FigureCanvasAgg(figure)
-    rows = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0] if drawn else []
+    rows: Any = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0] if drawn else []
     for axes, panel in zip(rows, drawn, strict=True):
         for label, stamps, values in panel.curves:
             style = "steps-post" if panel.steps else "default"
