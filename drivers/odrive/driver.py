@@ -226,7 +226,8 @@ class OdriveUnit(AxesUnit):
         """Brake along the ramp and hold; the fastest stop lets go, or brakes with all there is. Sent until it is
         confirmed.
         """
-        searches = self._homes[axis] and not self._has_homed[axis]
+        has_homed = self._has_homed[axis]
+        searches = self._homes[axis] and not has_homed
         self._homes[axis] = self._has_homed[axis] = False
         if searches or (fastest and self._settings.quick_stop == "idle"):
             yield from self._let_go(axis)
@@ -236,6 +237,8 @@ class OdriveUnit(AxesUnit):
             yield from self._velocity(axis, 0.0, abs(self.bank.settings[axis].acceleration_max / self._travel[axis]))
         if searches:
             yield from self._see_zero(axis)
+        elif has_homed:
+            yield from self._is_zero_off_the_switch(axis)
 
     def home(self, axis: int) -> Steps:
         """Begin the board's homing."""
@@ -463,7 +466,7 @@ class OdriveUnit(AxesUnit):
         elif self._has_homed[axis]:
             if stands and (state == CLOSED_LOOP or not self._settings.axis[axis].enable):
                 self._homes[axis] = self._has_homed[axis] = moving[axis] = False
-                done[axis] = True
+                done[axis] = yield from self._is_zero_off_the_switch(axis)
         elif state != HOMING and self.clock() - self._homing_since_ns[axis] > SWITCH_ON_NS:
             ((homed,),) = yield odrive.read([f"axis{self._numbers[axis]}.is_homed"], self._timeout_s)
             if homed:
@@ -471,6 +474,21 @@ class OdriveUnit(AxesUnit):
                 yield from self._close_loop(axis)
             else:
                 self._homes[axis], self._broken_off[axis], moving[axis] = False, True, not stands
+
+    def _is_zero_off_the_switch(self, axis: int) -> Generator[Step, Any, bool]:
+        """Say that the place is lost where a homing has ended on its switch.
+
+        Whatever requests another state in the half millisecond in which the board closes its loop at the switch makes
+        it take that place for its zero, and say that it is homed: the axis has not gone by the offset.
+        """
+        path = f"axis{self._numbers[axis]}.min_endstop."
+        try:
+            (pressed,), (offset,) = yield odrive.read([f"{path}endstop_state", f"{path}config.offset"], self._timeout_s)
+        except DeviceError:  # a firmware that does not tell
+            return True
+        if pressed and offset > 0:
+            self.lose_place(axis, f"its homing has ended on the switch, not {offset:g} turns off it; HOME again")
+        return not (pressed and offset > 0)
 
     def _see_zero(self, axis: int) -> Steps:
         """Say that the place is lost where the board has set its zero though its homing was stopped.

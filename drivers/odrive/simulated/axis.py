@@ -41,6 +41,7 @@ VOLATILE: dict[str, float] = {
     "controller.torque_setpoint": 0,
     "controller.vel_integrator_torque": 0,
     "controller.trajectory_done": 1,
+    "min_endstop.endstop_state": 0,
 }
 STORED: dict[str, float] = {
     "controller.config.control_mode": POSITION, "controller.config.input_mode": PASSTHROUGH,
@@ -69,8 +70,10 @@ FLAGS = (
     "config.enable_watchdog",
     "config.startup_closed_loop_control",
     "min_endstop.config.enabled",
+    "min_endstop.endstop_state",
 )
 READ_ONLY = (
+    "min_endstop.endstop_state",
     "current_state", "motor.is_armed", "motor.is_calibrated", "encoder.pos_estimate", "encoder.vel_estimate",
     "controller.pos_setpoint", "controller.vel_setpoint", "controller.torque_setpoint", "controller.trajectory_done",
 )  # fmt: skip
@@ -219,6 +222,7 @@ class Axis:
         if pressed and not self._was_pressed and p["current_state"] != HOMING:
             self.fail(MIN_ENDSTOP)
         self._was_pressed = pressed
+        p["min_endstop.endstop_state"] = int(pressed)
         if p["config.enable_watchdog"]:
             if self.left_s > 0:
                 self.left_s -= dt

@@ -439,13 +439,12 @@ def let_go_in_motion(torque: float = 10.0, **keys: Any) -> tuple[Joined, odrive.
     return rig, rotor
 
 
-@pytest.mark.parametrize("torque", [10.0, 1.0])
 @pytest.mark.parametrize("phase_us", range(0, 12000, 1000))
-def test_a_homing_ends_once_the_loop_is_closed_and_the_axis_stands(phase_us: int, torque: float) -> None:
+def test_a_homing_ends_once_the_loop_is_closed_and_the_axis_stands(phase_us: int) -> None:
     """The board lets go when its homing ends, and is idle and homed a turn of its loop before its estimate counts from
     the new zero. The turn is of 4 ms here, so that the lines of a poll fall into it on a slow line, too.
     """
-    rig, rotor = let_go_in_motion(torque)
+    rig, rotor = let_go_in_motion()
     step, late, ran_on = rotor.step, iter(range(4)), [0.0]
 
     def stepped(dt: float, powered: bool = True) -> None:
@@ -527,3 +526,32 @@ def test_a_homing_stopped_at_the_switch_sets_a_zero_there_and_the_place_is_lost(
     status = rig.unit.bank.rows["status"][0]
     assert status & AxisStatus.POSITION_LOST and not status & AxisStatus.HOMED
     assert "stopped while the board set its zero" in rig.unit.bank.fault_text(0)
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+def test_a_zero_that_another_master_makes_at_the_switch_is_not_believed(stopped: bool) -> None:
+    """Its request of idle comes in the half millisecond in which the board closes its loop there."""
+    rig, rotor = next(
+        (rig, rotor) for rig, rotor in map(until_the_switch, range(0, 60, 7)) if rotor._done and rotor._arms
+    )
+    rig.device.take(b"w axis0.requested_state 1\n")
+    while stopped and not rig.unit._has_homed[0]:
+        rig.poll()
+    if stopped:
+        rig.unit.bank.stop([0], rig.unit.clock())
+    rig.poll(60)
+    assert rotor.p["is_homed"] and abs(rotor.p["encoder.pos_estimate"]) < 1
+    status = rig.unit.bank.rows["status"][0]
+    assert status & AxisStatus.POSITION_LOST and not status & AxisStatus.HOMED
+    assert "ended on the switch" in rig.unit.bank.fault_text(0)
+
+
+def test_a_homing_that_ends_on_its_switch_is_not_believed() -> None:
+    """Its trajectory off the switch ends by time while the rotor still runs into it, for want of torque."""
+    rig, rotor = let_go_in_motion(torque=1.0)
+    rig.unit.bank.home([0], rig.unit.clock())
+    rig.poll(150)
+    assert rotor.p["is_homed"] and rotor.origin < -2.3, "where -1.75 is asked for"
+    status = rig.unit.bank.rows["status"][0]
+    assert status & AxisStatus.POSITION_LOST and not status & AxisStatus.HOMED
+    assert "ended on the switch" in rig.unit.bank.fault_text(0)
