@@ -28,6 +28,8 @@ from .unit import MappedUnit, Read, Values
 SELDOM_NS = 1_000_000_000
 SEARCH_RESTS_NS = 3_000_000_000
 """How long a drive may stand in the middle of a search for its reference."""
+BEGIN_NS = 100_000_000
+"""What a drive may take to begin a homing that it has taken."""
 HOME_TURNS = 0.005
 """How near to 0 a drive stands that has homed and has no status bit for that, in turns of the motor."""
 REST_S = 5.0
@@ -85,6 +87,8 @@ class DriveUnit(LineUnit):
         self._seldom_ns = 0
         self._alarm = 0
         self._homes = False
+        self._homing_ns = 0
+        """When a homing was asked for that has not been seen to begin; 0: it has."""
         self._homed: bool | None = None
         self._moved_ns = 0
         """When it moved last, or did not home [ns]."""
@@ -309,8 +313,9 @@ class DriveUnit(LineUnit):
         self._homed = None
         if "home" not in self._rmap.commands:
             raise DeviceError(errno.EOPNOTSUPP, "the drive cannot home by itself; use CALIBRATE_DEVICE")
-        self._homes = True
+        self._homes, self._homing_ns = True, self._clock()
         yield from self._mapped.command("home")
+        self._homing_ns = self._clock()
 
     def _reset(self) -> Steps:
         if self._alarm and self._rmap.alarms and self._alarm in self._rmap.alarms.lasting:
@@ -362,6 +367,10 @@ class DriveUnit(LineUnit):
         """Return whether the drive moves, and whether what it was told is done."""
         status: Mapping[str, Any] = self._axis.status
         moving = self._bit(values, "moving") if "moving" in status else not self._bit(values, "done")
+        if moving or ("homed" in status and not self._bit(values, "homed")):
+            self._homing_ns = 0
+        if self._homes and self._homing_ns and self._clock() - self._homing_ns < BEGIN_NS:
+            return moving, False  # what it tells yet may be of the homing before
         if self._homes and "homed" in status:
             done = self._bit(values, "homed")
         else:

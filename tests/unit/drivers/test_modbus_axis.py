@@ -231,6 +231,33 @@ def test_homing(make: Callable[..., Rig]) -> None:
     assert rig.position == 0
 
 
+@pytest.mark.parametrize("late_s", [0.0, 0.02, 0.06])
+def test_a_homing_that_the_drive_begins_late_is_not_the_one_before(late_s: float) -> None:
+    """Until it begins it tells of the homing before: at rest, and homed."""
+    rig = leadshine_rig()
+    rig.bank.home([0], rig.bus.clock_ns())
+    rig.until_idle()
+    rig.go(0.3)
+    rig.drive.mover.origin += 20000.0  # the machine's zero is elsewhere now: a strap has slipped
+    write, read = rig.drive.write, rig.drive.read
+    taken: list[tuple[float, Any]] = []
+
+    def late_read(*what: Any) -> Any:
+        while taken and rig.bus.now_s >= taken[0][0]:
+            write(*taken.pop(0)[1])
+        return read(*what)
+
+    rig.drive.read = late_read
+    rig.drive.write = lambda *what: taken.append((rig.bus.now_s + late_s, what))
+    rig.bank.home([0], rig.bus.clock_ns())
+    rig.poll()
+    rig.go(late_s + 0.1)
+    assert rig.drive.state()["velocity"] != 0 and rig.status & AxisStatus.HOMING
+    rig.until_idle()
+    assert rig.status & AxisStatus.HOMED and not rig.bank.fault_text(0)
+    assert rig.position == 0 and rig.drive.state()["place"] == pytest.approx(0.0, abs=1.0)
+
+
 @RIGS
 def test_a_homing_that_another_master_ends_is_no_home(make: Callable[..., Rig]) -> None:
     """The drive stands, without an alarm, and has no reference; one family tells of that by its position only."""
