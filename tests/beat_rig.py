@@ -168,7 +168,7 @@ class Device:
         self._kept = [files[0], *files[3:]]
         """What the runtime has mapped, and does not close: its process would."""
         self.runtime = Runtime(driver, "dev", table, 1, options, fds)
-        self.runtime.sees_requests = True
+        self.runtime.sees_requests, self.runtime.busy = True, group._busy
         self.driver: Any = self.runtime.driver
         self.member = Member(self.runtime, [], 0, "")
         group._members[self.runtime.poll_fd] = self.member
@@ -235,7 +235,7 @@ class Process:
 
     def serve_all(self) -> None:
         """Serve all whose turn it is."""
-        while any(self.group._due):
+        while self.group._due:
             self.serve()
 
     def order(self, device: Device, verb: DriverVerb, *arguments: object) -> None:

@@ -270,7 +270,7 @@ class World:
                 runtime.clients, runtime.statistics,
                 WriteDesk(
                     runtime.blocks, runtime.clients, runtime.stops, runtime.pages, runtime._request_fd, False,
-                    runtime.period_ns,
+                    runtime.period_ns, runtime.busy,
                 ),
             )  # fmt: skip
 

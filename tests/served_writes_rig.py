@@ -123,9 +123,10 @@ class Served:
     Args:
         queue: the buffers of its axes.
         request: a file that nobody writes to.
+        busy: of how many devices of the process writes are kept; None: of this one only.
     """
 
-    def __init__(self, queue: CommandQueue, request: int) -> None:
+    def __init__(self, queue: CommandQueue, request: int, busy: Any = None) -> None:
         self.ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         for end in (self.ours, self.theirs):
             end.setblocking(False)
@@ -138,7 +139,8 @@ class Served:
             first=row(1, count=MOST_WRITERS), known=row(len(AXES), count=MOST_WRITERS), axes=row(1, *AXES, count=4),
             heard=row(count=MOST_WRITERS), reset=row(count=MOST_WRITERS),
             request=StopFile(there=1, file=request, word=0, changed=changed_ns(request)), gives_way=0,
-            packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), kept=0, start=row(), size=row(), writer=row(),
+            packets=np.zeros(MOST_KEPT * ROOM, dtype=np.uint8), busy=row(count=1) if busy is None else busy,
+            kept=0, start=row(), size=row(), writer=row(),
             came=row(), effect=row(), took=row(), sent=row(), waiting=0, number=0, replace=0, at=0, records=0,
             grace_ns=0, patience_ns=0,
             reply=np.zeros(REPLY, dtype=np.uint8),

@@ -39,14 +39,16 @@ class WriteDesk:
         request: descriptor of the stop-request file.
         gives_way: whether processes of the same priority may run after every packet.
         period_ns: of its ticks [ns].
+        busy: one number, of how many devices of the process writes are kept.
     """
 
     def __init__(
         self, blocks: Sequence[AnyBlock], clients: Attachments, stops: Stops, pages: Pages, request: int,
-        gives_way: bool, period_ns: int,
+        gives_way: bool, period_ns: int, busy: NDArray[np.int64],
     ) -> None:  # fmt: skip
         self._clients, self._stops, self._pages = clients, stops, pages
         self._writers: list[Handle] = []
+        self._busy = busy
         self._packets = np.zeros(MOST_KEPT * ROOM, dtype=np.uint8)
         axes = [block for block in blocks if isinstance(block, AxisBlock)]
         plain = axes[0].bank.plain if axes else None
@@ -66,7 +68,7 @@ class WriteDesk:
             gives_way=int(gives_way),
             grace_ns=GRACE_NS if period_ns <= SOON_NS else 0,
             patience_ns=PATIENCE_NS if period_ns <= SOON_NS else 0,
-            packets=self._packets, kept=0, start=row(MOST_KEPT), size=row(MOST_KEPT), writer=row(MOST_KEPT),
+            packets=self._packets, busy=busy, kept=0, start=row(MOST_KEPT), size=row(MOST_KEPT), writer=row(MOST_KEPT),
             came=row(MOST_KEPT), effect=row(MOST_KEPT), took=row(MOST_KEPT), sent=row(MOST_KEPT), waiting=0, number=0,
             replace=0, at=0, records=0, reply=np.zeros(REPLY, dtype=np.uint8),
         )  # fmt: skip
@@ -117,6 +119,7 @@ class WriteDesk:
                 record.heard[i] = 0
                 self._clients.heard(self._writers[i], heard_ns)
         kept, record.kept = record.kept, 0
+        self._busy[0] -= kept > 0
         for i in range(kept):
             packet = bytes(self._packets[record.start[i] : record.start[i] + record.size[i]])
             self._clients.served(

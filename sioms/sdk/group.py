@@ -85,10 +85,13 @@ class Group:
         self._epoll.register(sock.fileno(), select.EPOLLIN)
         self._members: dict[int, Member] = {}
         self._built: deque[Member] = deque()
-        self._due: tuple[dict[int, None], ...] = ({}, {}, {}, {})
-        """Who has more to do than to tick, by rank and descriptor: one after another, the others tick in between."""
+        self._due: dict[int, int] = {}
+        """Who has more to do than to tick, by descriptor, and his rank: one after another, the others tick in between.
+        Those who have come before stand before."""
         self._pauses: dict[int, float] = {}
         """After how long members have to be served without an event."""
+        self._busy = np.zeros(1, dtype=np.int64)
+        """Of how many devices writes are kept, see ``serve_step.Desk``."""
         self._turns = 0
         self._loses = False
         """Whether somebody has just gone, who may have had more than has been seen."""
@@ -125,7 +128,7 @@ class Group:
     def _wait(self) -> list[int]:
         """Return the descriptors that are ready; those of members who have more to do are."""
         pauses = self._pauses
-        timeout_s = 0.0 if self._built or any(self._due) else min(pauses.values(), default=None)
+        timeout_s = 0.0 if self._built or self._due else min(pauses.values(), default=None)
         if library is None:
             found = [fd for fd, _ in self._epoll.poll(timeout_s)]
         else:
@@ -142,6 +145,9 @@ class Group:
             self._of[fd] = 0
             self._rank(fd, STANDS)
         else:
+            self._of[fd] = quiet.record.address
+            if self._due.get(fd) == STANDS:  # it can tick now
+                self._due[fd] = CAN_WAIT
             self._rank(fd, CALLED if quiet.record.called else CAN_WAIT)
 
     def _may_go_on(self, member: Member, quiet: QuietRun) -> bool:
@@ -153,21 +159,16 @@ class Group:
 
     def _rank(self, fd: int, rank: int) -> None:
         """Let a member wait with others of its rank, behind those that have come before, if not with better ones."""
-        if any(fd in better for better in self._due[:rank]):
-            return
-        for worse in self._due[rank + 1 :]:
-            worse.pop(fd, None)
-        self._due[rank].setdefault(fd)
+        self._due[fd] = min(rank, self._due.get(fd, rank))
 
     def _serve_next(self) -> None:
         """Serve the member whose turn it is."""
-        if not any(self._due):
+        if not self._due:
             return
         self._turns += 1
-        order = self._due if self._turns % FAIR else self._due[::-1]
-        waiting = next(each for each in order if each)
-        fd = next(iter(waiting))
-        del waiting[fd]
+        first = min if self._turns % FAIR else max
+        fd = first(self._due, key=self._due.__getitem__)
+        del self._due[fd]
         self._serve(fd, self._members[fd])
         if self._turns % IN_A_ROW == 0:
             time.sleep(PAUSE_S)
@@ -210,7 +211,7 @@ class Group:
         runtime = member.runtime
         self._settle(member)
         self._clear_away()
-        runtime.sees_requests = self._requests is not None
+        runtime.sees_requests, runtime.busy = self._requests is not None, self._busy
         self._members[runtime.poll_fd] = member
         self._epoll.register(runtime.poll_fd, select.EPOLLIN)
         self._guarded(member, runtime.start)
@@ -269,8 +270,7 @@ class Group:
         if not member.runtime.running:
             del self._members[fd]
             self._pauses.pop(fd, None)
-            for waiting in self._due:
-                waiting.pop(fd, None)
+            self._due.pop(fd, None)
             self._epoll.unregister(fd)
             member.runtime.release()
             _close(member.fds)

@@ -65,7 +65,7 @@ class QuietRun:
             lead_ns=lead_ns, announced=0, worked_ns=0, watched=1, rest_ns=idling.rest_ns, restless_ns=0, told=0,
             device=steps.record,
             tick=steps.tick, slack=steps.slack, rest=steps.rest, stop=steps.stop, desk=desk.record,
-            request=desk.request, early_ns=0, heeded_ns=0, brakes=0, braked_ns=0, patient=0, control=control,
+            request=desk.request, early_ns=0, heeded_ns=0, brakes=0, braked_ns=0, patient=0, known=0, control=control,
             called=0, spare=np.zeros(MOST_EVENTS, dtype=np.int64), instants=instants, scheduled_ns=0, ticked_ns=0,
             began_ns=0, number=0, waiting=0, left=0, done=0, expired=0, slackens=0,
             ring=statistics.ring.reshape(-1), ticks=0, skipped=0, longest_ns=0,

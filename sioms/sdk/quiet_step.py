@@ -99,7 +99,7 @@ class Quiet(Record):
     ``early_ns``: an early tick, off the grid, is due by the second timer; 0: none. ``heeded_ns``: the loop has yet to
     see to a stop, a reset or an order; what was asked for before this instant has been heeded. ``brakes``: steps have
     begun a stop, STOPS, or a halt, HALTS; ``braked_ns``: when something was stopped last. ``patient``: the device waits
-    for its turn in a process of several, and ticks on meanwhile.
+    for its turn in a process of several, and ticks on meanwhile; ``known``: of how many descriptors the loop knows.
 
     ``control``: descriptor of the daemon's socket. ``called``: it is among those that are ready. ``spare``: as many
     numbers as ``ready``.
@@ -143,6 +143,7 @@ class Quiet(Record):
     brakes: int
     braked_ns: int
     patient: int
+    known: int
     control: int
     called: int
     spare: Integers
@@ -332,13 +333,13 @@ def may_tick(q: Quiet, now_ns: int) -> int:
     """Return whether there is nothing that the loop has to see to before a tick.
 
     A stop is begun; orders that come behind it have time. Who waits for its turn ticks on before an order, and before a
-    reset as one who is stopped; one who has missed a stop and its reset does not. Writes that have been served
-    are worked in by the loop, where they may not wait.
+    reset as one who is stopped, by steps or before; one who has missed a stop and its reset does not. Writes that have
+    been served are worked in by the loop, where they may not wait.
     """
     if q.desk.kept and not may_wait(q, now_ns):
         return 0
     if q.latch[RESETS] != q.resets:
-        if not q.patient or not q.is_stopped:
+        if not q.patient or not (q.is_stopped or q.brakes == STOPS):
             return 0
         owe(q)
     elif (q.latch[STOPPED] != q.stopped and begin_stop(q, now_ns)) or has_missed(q):
@@ -538,6 +539,7 @@ def run(q: Quiet) -> int:
 def wait_turn(q: Quiet) -> int:
     """Have a device tick on until its turn comes, also with a tick that was left; return whether the loop has to."""
     q.patient = 1
+    q.known = q.waiting
     if not q.left:
         return q.slackens
     if q.expired:
@@ -557,6 +559,7 @@ def wait_turn(q: Quiet) -> int:
             q.ready[others] = q.ready[i]
             others += 1
     q.waiting = others
+    q.known = others
     return q.slackens
 
 
@@ -575,16 +578,19 @@ class Many(Record):
 
 @step
 def heed_one(q: Quiet, a: int, b: int, c: int) -> int:
-    """Do what is ready of one device; return whether its loop has to go on."""
+    """Do what is ready of one device; return whether its loop has to go on, of which it does not know yet."""
     count = wait_for(q.poll, q.ready, 0)
-    return heed(q, count) if count else 0
+    if not count or not heed(q, count):
+        return 0
+    return not q.patient or q.left or q.slackens or q.waiting > q.known
 
 
 @step
 def run_many(m: Many) -> int:
     """Wait, and tick the devices, until the loops of some have to go on; return of how many, which are ``ready``.
 
-    None is when a time-out is over in which nothing else was due, or after a signal.
+    None is when a time-out is over in which nothing else was due, after a signal, or where those that have to wait are
+    known, and are not waited for.
     """
     while True:
         count = wait_for(m.poll, m.ready, m.timeout_ms)
@@ -595,5 +601,5 @@ def run_many(m: Many) -> int:
             if not lent or m.heed(record_at(lent), 0, 0, 0):
                 m.ready[left] = fd
                 left += 1
-        if left or not count:
+        if left or not count or not m.timeout_ms:
             return left

@@ -135,6 +135,7 @@ class Runtime(Ticking):
         self._stops_workcell = bool(options["stop_sources"])
         self._lead_ns = self.engine.lead_ns if isinstance(self.engine, TickEngine) else 0
         self.sees_requests = False
+        self.busy = np.zeros(1, dtype=np.int64)
         self._quiet = None
 
     # --- services to the driver (Kit) ------------------------------------------------------------
@@ -251,8 +252,9 @@ class Runtime(Ticking):
         if self._stops_workcell or self.pages.watch or not self.sees_requests:
             return None
         desk = WriteDesk(
-            self.blocks, self.clients, self.stops, self.pages, self._request_fd, self.turns.gives_way, self.period_ns
-        )
+            self.blocks, self.clients, self.stops, self.pages, self._request_fd, self.turns.gives_way, self.period_ns,
+            self.busy,
+        )  # fmt: skip
         return quiet_run(
             self.driver, self._epoll.fileno(), self._timer.fd, self._line_timer.fd, self._control.fileno(),
             self._latch_words, self.period_ns, self._lead_ns, self._daemon_lease_ns, self._idling, self.pages,

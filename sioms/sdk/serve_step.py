@@ -30,6 +30,9 @@ MOST_KEPT: Final = 12
 """Packets that are kept until the loop has its turn."""
 ROOM: Final = 4096
 """Bytes of such a packet at most."""
+MOST_BUSY: Final = 2
+"""Devices of a process that have such packets. The loop takes 2 to 3 ms for each of them, before its next tick and
+before a stop."""
 REPLY: Final = 40
 REPLACE: Final = int(WriteFlag.REPLACE)
 WRITE: Final = int(HandleVerb.WRITE)
@@ -74,6 +77,9 @@ class Desk(Record):
     A tick that comes less than ``grace_ns`` behind the first packet that is kept may come before it; one that comes
     less than ``patience_ns`` behind it, while a client has yet to read an answer.
 
+    ``busy``: of how many devices of the process packets are kept. Where there are MOST_BUSY, what is written to others
+    waits for its turn, and its device ticks on.
+
     ``kept`` packets lie in ``packets``, each in ROOM bytes, from ``start`` on, where a gateway has put something ahead,
     with its ``size``, its ``writer``, when it ``came`` and took ``effect``, how long serving it ``took`` [ns], and
     whether its answer could be ``sent``; they hold ``waiting`` commands. ``at`` and ``records`` are the place in, and
@@ -93,6 +99,7 @@ class Desk(Record):
     grace_ns: int
     patience_ns: int
     packets: Bytes
+    busy: Integers
     kept: int
     start: Integers
     size: Integers
@@ -301,6 +308,8 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
         drop_packet(d.fds[who])
         note_word(d, who, heard_ns, came_ns)
         return 0
+    if not d.kept and d.busy[0] >= MOST_BUSY:
+        return 1
     d.at = begin
     heard_ns = read_passed(d, begin + size)
     if not heard_ns:
@@ -324,6 +333,7 @@ def serve_packet(d: Desk, who: int, tick: int) -> int:
     d.came[kept] = came_ns
     d.sent[kept] = sent >= 0
     d.waiting += count
+    d.busy[0] += not d.kept
     d.kept += 1
     d.took[kept] = clock_ns() - came_ns
     if d.gives_way:

@@ -119,6 +119,32 @@ def test_every_device_ticks_as_its_beat_says(hz: tuple[float, ...]) -> None:
                     raise AssertionError(f"{error}; trial {trial}") from error
 
 
+def test_all_tick_on_while_they_wait_to_tell_of_a_stop_and_its_reset() -> None:
+    """A hundred devices of four axes wait for some 0.3 s, and longer beside other work."""
+    with processes() as make:
+        process = make([100.0] * 12, [0.0] * 12)
+        for device in process.devices:
+            device.driver.rests = False
+        _see_it_tick(process)
+        for number, device in enumerate(process.devices):
+            device.driver.brakes = number % 4 > 0  # steps cannot begin the stop of some for now
+        process.request_stop()
+        process.latch.stop(CLOCK.now_ns, "eva")
+        process.look()
+        process.latch.reset(CLOCK.now_ns, process.devices[0].runtime.stops._request.mark)
+        served = 0
+        while process.group._due:
+            CLOCK.go_to(CLOCK.due_ns())
+            process.latch.daemon_alive(CLOCK.now_ns)
+            process.look()
+            process.serve()
+            served += 1
+            for device in process.devices:
+                device.driver.brakes = True
+                assert CLOCK.now_ns - device.driver.ticks[-1][0] < 3 * device.beat_ns, f"not behind, {served} served"
+        assert served > 12
+
+
 def test_nothing_is_left_of_a_device_that_has_ended() -> None:
     """A device that is restarted or changed comes back to the process that is there."""
     with processes() as make:

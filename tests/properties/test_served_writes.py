@@ -7,6 +7,7 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 import served_writes_rig
 from served_writes_rig import AXES, TICK, Served, packets, queue_of
@@ -130,6 +131,23 @@ def test_a_dozen_writes_in_a_row_is_served_and_before_a_tick_may_not_wait_any_mo
     assert [served.serve(packet) for _ in range(13)] == [*[True] * 12, False] and served.left() == packet
     assert GRACE_NS > 12 * 18_000
     served.close()
+
+
+def test_two_devices_of_a_process_have_writes_that_are_kept_and_no_third(request_file):
+    chance = random.Random(1)
+    queue = queue_of(chance)
+    queue.latched[:] = 0
+    queue.home_required[:] = False
+    packet = next(p for p, _ in packets(chance) if (taken(queue, p, 0) or (0, 0))[1] == 1)
+    busy = np.zeros(1, dtype=np.int64)
+    first, second, third = devices = [Served(queue, request_file, busy) for _ in range(3)]
+    assert first.serve(packet) and second.serve(packet) and second.serve(packet) and busy[0] == 2
+    assert not third.serve(packet) and third.left() == packet, "it waits for the loop, and its device ticks on"
+    assert third.serve(verbs.Heard(5).packed()), "leases do not wait"
+    busy[0] = 1
+    assert third.serve(packet) and busy[0] == 2
+    for device in devices:
+        device.close()
 
 
 def test_a_stop_that_is_asked_for_comes_before_the_next_write(request_file):

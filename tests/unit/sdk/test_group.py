@@ -81,7 +81,7 @@ def test_what_a_device_raises_ends_it_alone(group, where):
         if member.runtime.running:
             group._serve(member.runtime.poll_fd, member)
     group._heed_requests()
-    while any(group._due):
+    while group._due:
         group._serve_next()
     assert bad.runtime.did[-2:] == [f"stopped: {where}", "released"], "stopped first, and once"
     assert bad.runtime.did.count("released") == 1 and not bad.runtime.running
@@ -133,14 +133,17 @@ def put(group, members, **record):
         group._put(member.runtime.poll_fd)
 
 
+def waiting(group, rank):
+    return [fd for fd, its in group._due.items() if its == rank]
+
+
 def test_whose_tick_is_the_loops_and_whom_the_daemon_calls_go_first(group):
     members = start(group, *[""] * 9)
     patient, called, standing = members[:3], members[3:6], members[6:]
     put(group, members)
     put(group, called, called=1)
     put(group, standing, left=1, called=1)
-    put(group, standing, left=0)
-    assert [[*waiting] for waiting in group._due] == [
+    assert [waiting(group, rank) for rank in (STOPS, STANDS, CALLED, CAN_WAIT)] == [
         [], *([member.runtime.poll_fd for member in each] for each in (standing, called, patient)),
     ]  # fmt: skip
     served = []
@@ -154,13 +157,21 @@ def test_whose_tick_is_the_loops_and_whom_the_daemon_calls_go_first(group):
     )
 
 
+def test_one_whose_tick_was_the_loops_ticks_on_when_it_can(group):
+    (member,) = start(group, "")
+    fd, member.runtime.record.address = member.runtime.poll_fd, 5
+    put(group, [member], left=1)
+    assert group._of[fd] == 0 and group._due == {fd: STANDS}
+    put(group, [member], left=0)
+    assert group._of[fd] == 5 and group._due == {fd: CAN_WAIT}, "those that cannot go first"
+
+
 def test_who_is_stopped_already_does_not_go_first_when_somebody_stops(group):
     first, stopped, braking, moving, standing = start(group, "", "", "", "", "")
     stopped.runtime.record.is_stopped, braking.runtime.record.stopped = 1, 5
     put(group, [standing], left=1, stopped=5)
     group._heed_requests()
-    found = [group._due[rank] for rank in (STOPS, STANDS, CALLED, CAN_WAIT)]
-    assert [[*each] for each in found] == [
+    assert [waiting(group, rank) for rank in (STOPS, STANDS, CALLED, CAN_WAIT)] == [
         [first.runtime.poll_fd, moving.runtime.poll_fd], [standing.runtime.poll_fd], [], [braking.runtime.poll_fd],
     ]  # fmt: skip
 
@@ -189,9 +200,9 @@ def test_whose_owner_has_gone_halts_by_steps_or_goes_first_and_is_ended_before_a
     put(group, members)
     assert group._loses, "others may go with them"
     put(group, [refuses], stopped=1)
-    assert [*group._due[STOPS]] == [refuses.runtime.poll_fd]
-    assert [*group._due[CAN_WAIT]] == [member.runtime.poll_fd for member in (patient, halts)]
-    while any(group._due):
+    assert waiting(group, STOPS) == [refuses.runtime.poll_fd]
+    assert waiting(group, CAN_WAIT) == [member.runtime.poll_fd for member in (patient, halts)]
+    while group._due:
         group._serve_next()
     for member in (halts, refuses):
         assert member.runtime.did == ["start", "lend", "take back", "owner ended", "serve", "lend"]

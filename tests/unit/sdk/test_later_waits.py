@@ -99,7 +99,8 @@ def test_another_command_of_that_axis_ends_it(writer: Writer, axis: int) -> None
 
 def test_steps_serve_no_client_that_is_yet_to_be_told(writer: Writer) -> None:
     runtime = writer.world.runtime
-    desk = WriteDesk(runtime.blocks, runtime.clients, runtime.stops, runtime.pages, runtime._request_fd, False, 10**6)
+    of_process = runtime.clients, runtime.stops, runtime.pages, runtime._request_fd
+    desk = WriteDesk(runtime.blocks, *of_process, False, 10**6, runtime.busy)
     desk.lend()
     assert desk.record.count == 1
     writer.jog()

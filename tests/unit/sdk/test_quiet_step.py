@@ -74,8 +74,8 @@ class Device:
             "announced": 0, "worked_ns": 0, "watched": 1, "rest_ns": 0, "restless_ns": 0, "told": 0,
             "device": Page.empty(), "instants": np.zeros(2, dtype=np.int64), "scheduled_ns": 0, "began_ns": 0,
             "number": 7, "waiting": 0, "left": 0, "early_ns": 0, "heeded_ns": 0, "ticked_ns": 0, "brakes": 0,
-            "braked_ns": 0, "patient": 0,
-            "called": 0, "control": self.control, "desk": Desk.empty(), "request": StopFile.empty(),
+            "braked_ns": 0, "patient": 0, "known": 0, "called": 0, "control": self.control,
+            "desk": Desk.empty(), "request": StopFile.empty(),
             "spare": np.zeros(64, dtype=np.int64), "done": 0, "expired": 1, "slackens": 0,
             "ring": self.ring, "ticks": 0, "skipped": 0, "longest_ns": 0,
         }  # fmt: skip
@@ -317,9 +317,10 @@ def test_an_order_to_another_device_is_not_looked_at_by_the_loop(make):
     assert (len(device.ticks), device.quiet.orders, device.quiet.heeded_ns) == (1, 3, 0)
 
 
-@pytest.mark.parametrize("what", ["an order", "a reset of who is stopped"])
+@pytest.mark.parametrize("what", ["an order", "a reset of who is stopped", "a reset of who is stopped by steps"])
 def test_who_waits_for_its_turn_ticks_on_and_shows_what_it_had_heeded(make, what):
-    device = make(began_ns=77, is_stopped=int(what != "an order"))
+    brakes = STOPS if what.endswith("by steps") else 0
+    device = make(began_ns=77, is_stopped=int(what == "a reset of who is stopped"), brakes=brakes)
     if what == "an order":
         device.latch[ORDERS] = 1
         os.eventfd_write(device.control, 1)
@@ -328,7 +329,7 @@ def test_who_waits_for_its_turn_ticks_on_and_shows_what_it_had_heeded(make, what
     os.eventfd_write(device.timer, 1)
     assert run(device.quiet) >= 1 and device.quiet.left and not device.ticks
     assert wait_turn(device.quiet) == 0 and len(device.ticks) == 1
-    assert (device.quiet.heeded_ns, device.quiet.brakes, device.quiet.expired, device.quiet.left) == (77, 0, 0, 0)
+    assert (device.quiet.heeded_ns, device.quiet.brakes, device.quiet.expired, device.quiet.left) == (77, brakes, 0, 0)
     assert device.quiet.called == (what == "an order")
     assert device.timer not in device.ready[: device.quiet.waiting], "that tick is done"
     os.eventfd_write(device.timer, 1)
@@ -435,6 +436,30 @@ def test_of_many_devices_only_those_with_more_to_do_are_the_loops(make):
         count = run_many(many)
         assert set(ready[:count].tolist()) == {device.poll.fileno() for device in devices[1:]}
     assert [len(device.ticks) for device in devices] == [1, 1, 0]
+
+
+def test_who_waits_for_its_turn_is_the_loops_again_when_something_else_is_ready(make):
+    device = make(expired=0)
+    with select.epoll() as poll:
+        poll.register(device.poll.fileno(), select.EPOLLIN)
+        of = np.zeros(1024, dtype=np.int64)
+        of[device.poll.fileno()] = device.quiet.address
+        many = Many(
+            poll=poll.fileno(), ready=np.zeros(64, dtype=np.int64), timeout_ms=0, of=of, size=len(of), heed=heed_one
+        )
+
+        def waits():
+            return [run_many(many), wait_turn(device.quiet)]
+
+        os.eventfd_write(device.other, 1)
+        assert waits() == [1, 0] and run_many(many) == run_many(many) == 0, "it is known, and is not waited for"
+        os.eventfd_write(device.timer, 1)
+        assert run_many(many) == 0 and len(device.ticks) == 1
+        os.eventfd_write(device.control, 1)
+        assert waits() == [1, 0] and device.quiet.called and run_many(many) == 0
+        device.answer = 1
+        os.eventfd_write(device.timer, 1)
+        assert waits() == [1, 1], "its tick is the loop's"
 
 
 def plain_write(served):
