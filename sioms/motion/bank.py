@@ -251,10 +251,12 @@ class Bank(ABC):
         self._braked[chosen] = False
         self._halt(chosen, self._catch_up(now_ns), fastest=False)
 
-    def emergency_stop(self, axes: AxesLike, now_ns: int) -> None:
-        """Empty the buffers and stop the fastest way there is; latched: writes are refused (EPERM) until reset()."""
+    def emergency_stop(self, axes: AxesLike, now_ns: int, text: str = "emergency stop") -> None:
+        """Empty the buffers and stop the fastest way there is; latched: writes are refused (EPERM) until reset(), with
+        the text of the first stop.
+        """
         chosen = np.asarray(axes, dtype=np.int64)
-        self._queue.latched_ns[chosen] = now_ns
+        self._queue.note_stop(chosen, text, now_ns)
         fresh = chosen[((self._queue.latched[chosen] & EMERGENCY_STOP) == 0) | self._braked[chosen]]
         self._braked[chosen] = False
         if not fresh.size:
@@ -346,7 +348,7 @@ class Bank(ABC):
     def end_stop(self, axes: AxesLike) -> None:
         """Clear the emergency stop of axes in fault, which stay so."""
         chosen = np.asarray(axes, dtype=np.int64)
-        self._queue.latched[chosen] &= ~EMERGENCY_STOP
+        self._queue.end_stop(chosen)
         self._show(chosen)
 
     def forget_settings(self, axes: AxesLike) -> None:

@@ -103,6 +103,7 @@ class CommandQueue:
         self.plain = PlainCheck(self._validator.offered, self.limits)
         self._waiting: dict[tuple[int, int], set[int]] = {}
         self._fault_text: dict[int, str] = {}
+        self._stop_text: dict[int, str] = {}
         self._new_faults: list[int] = []
         self._lost_text: dict[int, str] = {}
         self._events: list[tuple[EventKind, Any, int, int, str]] = []
@@ -240,7 +241,7 @@ class CommandQueue:
         axis = int(axes[barred.argmax()])
         bits, what = int(self.latched[axis]), f"write axis {axis} ({self.settings[axis].name}): "
         if bits & AxisStatus.EMERGENCY_STOP:
-            raise CommandError(errno.EPERM, what + "stopped by emergency stop; RESET first")
+            raise CommandError(errno.EPERM, what + f"stopped: {self.stop_text(axis)}; RESET first")
         if bits & AxisStatus.FAULT:
             raise CommandError(errno.EIO, what + f"in fault ({self.fault_text(axis)}); RESET first")
         if bits & AxisStatus.HOMING:
@@ -377,7 +378,7 @@ class CommandQueue:
             if self.settings[axis].homing is None:
                 raise CommandError(errno.EINVAL, what + "no homing is configured for it")
             if latched & AxisStatus.EMERGENCY_STOP:
-                raise CommandError(errno.EPERM, what + "stopped by emergency stop; RESET first")
+                raise CommandError(errno.EPERM, what + f"stopped: {self.stop_text(axis)}; RESET first")
             if latched & AxisStatus.FAULT:
                 raise CommandError(errno.EIO, what + f"in fault ({self.fault_text(axis)}); RESET first")
             if not free:
@@ -455,6 +456,16 @@ class CommandQueue:
 
     # -- latches and events -------------------------------------------------------------------
 
+    def note_stop(self, axes: NDArray[np.int64], text: str, now_ns: int) -> None:
+        """Keep why these axes are under an emergency stop, and since when; the first reason stays."""
+        self.latched_ns[axes] = now_ns
+        for axis in axes.tolist():
+            self._stop_text.setdefault(axis, text)
+
+    def stop_text(self, axis: int) -> str:
+        """Return why an axis is under an emergency stop."""
+        return self._stop_text.get(axis, "emergency stop")  # of one that steps have obeyed, it is told a moment later
+
     def latch_fault(self, axes: NDArray[np.int64], text: str, now_ns: int, errno_: int = errno.EIO) -> None:
         """Set the fault latch of these axes with its reason; the first reason stays."""
         fresh = axes[(self.latched[axes] & FAULT) == 0]
@@ -514,10 +525,16 @@ class CommandQueue:
                 "on; see why, and reset again",
             )
 
+    def end_stop(self, axes: NDArray[np.int64]) -> None:
+        """Clear the emergency stop of these axes."""
+        self.latched[axes] &= ~EMERGENCY_STOP
+        for axis in axes.tolist():
+            self._stop_text.pop(axis, None)
+
     def unlatch(self, axes: NDArray[np.int64]) -> None:
         """Clear emergency stop and fault of these axes."""
-        bits = AxisStatus.EMERGENCY_STOP | AxisStatus.FAULT | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED
-        self.latched[axes] &= ~int(bits)
+        self.end_stop(axes)
+        self.latched[axes] &= ~int(AxisStatus.FAULT | AxisStatus.FOLLOWING_ERROR | AxisStatus.STALLED)
         for axis in axes.tolist():
             self._fault_text.pop(axis, None)
 

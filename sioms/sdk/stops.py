@@ -306,7 +306,7 @@ class Stops(Resets):
                 case Stop.CONTROLLED:
                     block.bank.stop(axes, now_ns)
                 case Stop.EMERGENCY | Stop.FAILURE:
-                    block.bank.emergency_stop(axes, now_ns)
+                    block.bank.emergency_stop(axes, now_ns, reason.text)
                 case Stop.LOSS:
                     block.bank.fault(axes, reason.text, now_ns)
 

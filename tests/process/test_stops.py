@@ -92,7 +92,7 @@ def test_stop_of_a_node_leaves_the_others_moving(cell: sioms.Workcell, daemon: D
             seen.emergency_stop()
         at_rest(mine, 2.0)
         assert waiting.errno() == errno.ECANCELED
-        with raises(errno.EPERM, "mod0.xaxis"):
+        with raises(errno.EPERM, "mod0.xaxis", "emergency stop by ", "; RESET first"):
             mine.move(0.0)
         number = other.read().number
         other.wait_new(number + 100, 3.0)
@@ -100,9 +100,9 @@ def test_stop_of_a_node_leaves_the_others_moving(cell: sioms.Workcell, daemon: D
         mine.reset()
         mine.move(0.0)
         mine.wait_until_idle(5.0)
-        cell.emergency_stop("mod0.yaxis")  # through the daemon, without a handle
+        cell.emergency_stop("mod0.yaxis", "a hand is in it")  # through the daemon, without a handle
         at_rest(other, 2.0)
-        with raises(errno.EPERM):
+        with raises(errno.EPERM, "emergency stop by ", ": a hand is in it; RESET first"):
             other.move(0.0)
         cell.reset("mod0.yaxis")
         other.move(0.0, timeout=0.5)

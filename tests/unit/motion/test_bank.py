@@ -191,11 +191,12 @@ def test_emergency_stop_latches_and_nothing_resumes():
     rig.write(mode=[MODE.POSITION] * 2, position=[1.0, 2.0])
     rig.tick(100)
     assert rig.field("force", 1) == 5.0
-    rig.bank.emergency_stop([0, 1], rig.now_ns)
+    rig.bank.emergency_stop([0, 1], rig.now_ns, "emergency stop by eva")
+    rig.bank.emergency_stop([0, 1], rig.now_ns, "emergency stop by tom")
     rig.tick(1)
     assert rig.field("force", 1) == 0.0
     assert rig.field("status") & S.EMERGENCY_STOP
-    with pytest.raises(CommandError) as caught:
+    with pytest.raises(CommandError, match="stopped: emergency stop by eva; RESET first") as caught:
         rig.write(mode=MODE.POSITION, position=0.0)
     assert caught.value.errno == errno.EPERM
     rig.tick(1000)
@@ -207,6 +208,9 @@ def test_emergency_stop_latches_and_nothing_resumes():
     assert rig.field("commanded_position") == rest
     assert not rig.field("status") & S.EMERGENCY_STOP
     rig.write(mode=MODE.POSITION, position=rest)
+    rig.bank.emergency_stop([0], rig.now_ns, "emergency stop by tom")
+    with pytest.raises(CommandError, match="stopped: emergency stop by tom"):
+        rig.write(mode=MODE.POSITION, position=0.0)
 
 
 @pytest.mark.parametrize("mode", [{"mode": MODE.VELOCITY, "velocity": 1.7}, {"mode": MODE.ACCELERATION, "acceleration": 5.0},  # noqa: E501
