@@ -5,12 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from itertools import groupby
 
-from .figures import PERCENTILES, Figure
+from .figures import PERCENTILES, Bar, Figure
 
 
 def markdown(figures: Sequence[Figure]) -> str:
-    """Return a heading and a table for each sub-bench, in the order in which they ran."""
-    return "\n".join(_table(bench, list(group)) for bench, group in groupby(figures, lambda f: f.bench))
+    """Return a table of all targets, then a heading and a table for each sub-bench, in the order in which they ran."""
+    tables = [_table(bench, list(group)) for bench, group in groupby(figures, lambda f: f.bench)]
+    return "\n".join([*_targets(figures), *tables])
+
+
+def _targets(figures: Sequence[Figure]) -> list[str]:
+    rows = [
+        _row([f"`{each.bench}`", each.name + _unit(each), f"{bar.statistic} {_number(found)}".removeprefix("value "),
+              _limit(bar), "met" if met else "**missed**"])
+        for each in figures for bar, found, met in each.verdicts()
+    ]  # fmt: skip
+    head = [_row(["sub-bench", "figure", "found", "target", ""]), _row(["---"] * 5)]
+    return ["### Targets", "", *head, *rows, ""] if rows else []
+
+
+def _unit(figure: Figure) -> str:
+    return f" [{figure.unit}]" if figure.unit else ""
+
+
+def _limit(bar: Bar) -> str:
+    return f"{'≥' if bar.at_least else '≤'} {bar.limit:g}"
 
 
 def _table(bench: str, figures: list[Figure]) -> str:
@@ -25,7 +44,6 @@ def _table(bench: str, figures: list[Figure]) -> str:
 
 
 def _line(figure: Figure) -> str:
-    unit = f" [{figure.unit}]" if figure.unit else ""
     if figure.summary is not None:
         cells = [
             str(figure.summary.count),
@@ -35,13 +53,12 @@ def _line(figure: Figure) -> str:
         cells = ["", _number(figure.value or 0.0), *[""] * (len(PERCENTILES) - 1)]
     ratio = f"{figure.ratio:.3g}" if figure.ratio is not None else ""
     notes = [figure.notes] if figure.notes else []
-    return _row([figure.name + unit, *cells, ratio, "; ".join([*_bars(figure), *notes])])
+    return _row([figure.name + _unit(figure), *cells, ratio, "; ".join([*_bars(figure), *notes])])
 
 
 def _bars(figure: Figure) -> Iterable[str]:
     for bar, _, met in figure.verdicts():
-        sign = "≥" if bar.at_least else "≤"
-        yield f"{bar.statistic} {sign} {bar.limit:g}: {'met' if met else '**missed**'}"
+        yield f"{bar.statistic} {_limit(bar)}: {'met' if met else '**missed**'}"
 
 
 def _number(value: float) -> str:

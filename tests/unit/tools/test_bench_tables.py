@@ -17,12 +17,17 @@ def test_each_sub_bench_is_a_table_with_its_verdicts(capsys: object) -> None:
     report.begin("axes", "axes")
     report.value("axes carried", 2500, bars=[Bar("value", 2000, True)], notes="core 60%")
     lines = markdown(report.figures).splitlines()
-    assert [line for line in lines if line.startswith("#")] == ["### read", "### axes"]
+    assert [line for line in lines if line.startswith("#")] == ["### Targets", "### read", "### axes"]
+    assert lines[4:7] == [
+        "| `read` | ours [us] | p50 2 | ≤ 1.5 | **missed** |",
+        "| `read` | ours [us] | ratio 0.2 | ≤ 0.25 | met |",
+        "| `axes` | axes carried | 2500 | ≥ 2000 | met |",
+    ]
     ours = next(line for line in lines if line.startswith("| ours [us] |"))
     assert "| 3 | 2 |" in ours and "| 0.2 |" in ours
     assert "p50 ≤ 1.5: **missed**; ratio ≤ 0.25: met" in ours
     assert lines[-1] == "| axes carried |  | 2500 |  |  |  |  |  | value ≥ 2000: met; core 60% |"
-    widths = {line.count("|") for line in lines if line.startswith("|")}
+    widths = {line.count("|") for line in lines[lines.index("### read") :] if line.startswith("|")}
     assert widths == {10}
 
 
