@@ -132,7 +132,7 @@ class Leases:
     def _take(self, name: str, who: str, lease_s: float) -> None:
         cell = self._connect(f"sioms epics for {who}")
         try:
-            node = self._prompt.date(cell.open(name, "rw", lease=lease_s))
+            node = self._prompt.date(cell.open(name, "rw", lease=lease_s), asked_before=True)
         except BaseException:
             cell.close()
             raise

@@ -69,9 +69,15 @@ class Prompt:
         finally:
             self._word.reset(token)
 
-    def date(self, node: Any) -> Any:
-        """Have all that is sent on a node's handle carry when its client said it; return the node."""
+    def date(self, node: Any, *, asked_before: bool) -> Any:
+        """Have all that is sent on a node's handle carry when its client said it; return the node.
+
+        Args:
+            node: it has just been opened.
+            asked_before: whether something may be for it that was said before it was open.
+        """
         channel = node._channel
+        open_ns = 0 if asked_before else self._clock()
         if channel.carrier is None:  # a gateway tells by itself how old it is
-            channel.said_ns = lambda: self._word.get(0) or self._clock()
+            channel.said_ns = lambda: max(self._word.get(0) or self._clock(), open_ns)
         return node

@@ -206,7 +206,7 @@ class Nodes(mfusepy.Operations):  # type: ignore[misc]
 
     def _made(self, cell: Any, node: Any, who: Caller, place: NodePlace, *, nonblock: bool, owned: bool) -> NodeFile:
         if owned:
-            self.prompt.date(node)
+            self.prompt.date(node, asked_before=False)  # nobody has the file yet
         return NodeFile(cell, node, who, self._patience, binary=place.binary, nonblock=nonblock, owned=owned)
 
     def _new(self, file: NodeFile | bytes | None) -> int:

@@ -9,7 +9,7 @@ import pytest
 
 from sioms.bridges import leases
 
-UNDATED: Any = SimpleNamespace(date=lambda node: node)
+UNDATED: Any = SimpleNamespace(date=lambda node, asked_before: node)
 
 
 class Node:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from types import SimpleNamespace
 
 from sioms.bridges.prompt import LATE_NS, SETTLE_NS, Prompt
 
@@ -36,3 +37,21 @@ def test_it_beats_by_itself() -> None:
     while prompt._seen[0] == made_ns:
         assert time.monotonic() < until_s
         time.sleep(0.001)
+
+
+def test_nothing_is_for_a_file_from_before_it_was_open() -> None:
+    now = [10**12]
+    prompt = Prompt(lambda: now[0], beats=False)
+
+    def said_ns(*, asked_before: bool) -> int:
+        node = SimpleNamespace(_channel=SimpleNamespace(carrier=None))
+        with prompt.word():
+            prompt.date(node, asked_before=asked_before)
+        with prompt.word():
+            told_ns: int = node._channel.said_ns()
+        return told_ns
+
+    held_ns = now[0]
+    now[0] += 2 * LATE_NS
+    assert said_ns(asked_before=True) == held_ns, "a put that waited behind the one that took the node"
+    assert said_ns(asked_before=False) == now[0], "when it was opened"
