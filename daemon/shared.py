@@ -20,6 +20,11 @@ from .stop_record import StopRecord
 if TYPE_CHECKING:
     from sioms.protocol.stopfile import Mark
 
+UNKNOWN = (
+    "the daemon before was killed, and the journal of stops, as one of an earlier version, does not say whether its "
+    "requests to stop had been reset; look, then reset"
+)
+"""Why a workcell is stopped from its start, where a file is left that no entry tells of."""
 _SEALS = fcntl.F_SEAL_SHRINK | fcntl.F_SEAL_GROW | fcntl.F_SEAL_SEAL
 
 
@@ -67,6 +72,8 @@ class Shared:
         else:
             self.left.append(mark := before.mark)
             source = before.source if mark not in state.answered else ""
+            if source and not any(changed_ns for _, changed_ns in state.answered):
+                source = f"{UNKNOWN}; its last writer: {source if mark[0] else 'nobody'}"
         if source and not state.workcell:
             self._note(workcell_entry(source, stop=True, named=True))
 

@@ -359,6 +359,24 @@ def test_a_daemon_that_dies_at_its_start_loses_no_stop_that_nobody_has_heard(
     assert not os.path.exists(again.record.path)
 
 
+@pytest.mark.parametrize(("asked", "writer"), [(True, "fire"), (False, "nobody")])
+def test_a_file_that_the_journal_does_not_know_is_a_stop_that_says_why(
+    start: Callable[[], Daemon], *, asked: bool, writer: str
+) -> None:
+    """As the first daemon behind one of an earlier version that was killed, whose journal keeps words alone."""
+    first = start()
+    word = first.request.request(1000, PID, "fire")[0] if asked else 0
+    first.die()
+    os.truncate(first.record.path, 0)
+    first.drivers_journal.append({"workcell": "", "stop": False, "by": "eva", "resets": 1, "request": word}, 0.0)
+    again = start()
+    why, _, last = again.stopped_by.partition("; its last writer: ")
+    assert "an earlier version" in why and writer in last
+    again.reset()
+    again.die()
+    assert not start().stopped_by
+
+
 @pytest.mark.parametrize("place", range(8))
 def test_a_daemon_that_dies_anywhere_in_its_start_is_stopped_by_nothing_that_was_reset(
     start: Callable[[], Daemon], monkeypatch: pytest.MonkeyPatch, place: int
