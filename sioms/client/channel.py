@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import errno
 import os
-from _socket import CMSG_SPACE, SCM_RIGHTS, SHUT_RDWR, SO_PEERCRED, SO_RCVTIMEO, SOL_SOCKET, socket
+from _socket import CMSG_SPACE, SHUT_RDWR, SO_PEERCRED, SO_RCVTIMEO, SOL_SOCKET, socket
 from _thread import allocate_lock, get_ident
+from itertools import chain, repeat
 from struct import pack, unpack
 from time import monotonic
 
@@ -24,7 +25,7 @@ from .shown import acknowledged_by_daemon
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Iterator, Sequence
     from typing import Any
 
     from sioms.protocol.clock import Clock
@@ -94,9 +95,7 @@ class Call:
 
 
 class Descriptors(list[int]):
-    """Descriptors that came with an answer. Those that nobody takes out are closed, however it comes that nobody does:
-    of a node that has been opened for who is interrupted, its driver sees the end of file.
-    """
+    """Descriptors that came with an answer, if any did."""
 
     __slots__ = ()
 
@@ -110,6 +109,27 @@ class Descriptors(list[int]):
         """Close them."""
         while self:
             os.close(self.pop())
+
+
+class Untaken(Descriptors):
+    """Some that did. Those that nobody takes out are closed, however it comes that nobody does: of a node that has been
+    opened for who is interrupted, its driver sees the end of file.
+
+    With the last of them it is one no longer: an interrupt that came in a ``__del__`` would be shown and forgotten.
+    """
+
+    __slots__ = ()
+
+    def take(self) -> list[int]:
+        """Return them; they are the caller's."""
+        taken = super().take()
+        self.__class__ = Descriptors  # type: ignore[assignment]
+        return taken
+
+    def close(self) -> None:
+        """Close them."""
+        super().close()
+        self.__class__ = Descriptors  # type: ignore[assignment]
 
     __del__ = close
 
@@ -125,11 +145,14 @@ class Answer:
 
 
 def _fds_of(ancillary: list[tuple[int, int, bytes]]) -> Descriptors:
-    # Without the module array: it drags a third of the start time of a shell tool behind it.
-    fds = Descriptors()
-    for level, kind, data in ancillary:
-        if level == SOL_SOCKET and kind == SCM_RIGHTS:
-            fds += memoryview(data[: len(data) - len(data) % 4]).cast("i")
+    # In one step, as ``Channel._received``. Without the module array, which drags a third of the start time of a shell
+    # tool behind it.
+    if not ancillary:
+        return Descriptors()
+    fds = Untaken()
+    rows = map(list.pop, repeat(ancillary, len(ancillary)))
+    parts: Iterator[Any] = map(memoryview, map(tuple.__getitem__, rows, repeat(2)))  # type: ignore[arg-type]
+    fds.extend(chain.from_iterable(map(memoryview.cast, parts, repeat("i"))))  # type: ignore[arg-type]
     return fds
 
 
@@ -178,6 +201,7 @@ class Channel:
         self._reading = 0
         self._abandoned: dict[int, Message | None] = {}
         self._answers: dict[int, tuple[list, Descriptors]] = {}  # type: ignore[type-arg]
+        self._came: list[tuple[bytes, list[tuple[int, int, bytes]], int, Any]] = []
         self._waiting: dict[int, object] = {}
         self._timeout = 0.0
         self.keepalive_s = 0.0
@@ -452,9 +476,11 @@ class Channel:
             OSError: the other side is gone, or has ended this channel with a reason.
         """
         try:
-            return self._packet(_DONTWAIT)
+            found = self._packet(_DONTWAIT)
         except BlockingIOError:
             return None
+        del self._came[:]
+        return found
 
     def close(self) -> None:
         """Close the socket; waiting threads get EBADF. In a forked child that of its parent stays open."""
@@ -482,38 +508,52 @@ class Channel:
             packet = b"" if self.carrier is None else self.carrier.wait(timeout)
             try:
                 message, fds = self._decoded(packet, Descriptors()) if packet else self._packet(self._flags)
+                self._sort(message, fds)
             except BlockingIOError:
                 if self.keepalive_s:
                     self.keepalive()
                 continue
-            self._sort(message, fds)
+            except KeyboardInterrupt:
+                if self._came:  # it may be for another thread, or bring what its request has been granted
+                    self._sort(*self._packet(self._flags))
+                raise
             if message[1] == number:
                 return True
 
     def _sort(self, message: list[Any], fds: Descriptors) -> None:
         """Keep an answer for whom it is for."""
         if message[1] in self._abandoned:
+            del self._came[:]
             self._drop(message, fds)
             return
         with self._mutex:
             self._answers[message[1]] = (message, fds)
+            del self._came[:]  # no signal is heeded between these two
             turn = self._waiting.pop(message[1], None)
         if turn is not None:
             turn.release()  # type: ignore[attr-defined]
 
     def _packet(self, flags: int) -> tuple[list, Descriptors]:  # type: ignore[type-arg]
-        fds = Descriptors()
+        if not self._passed:
+            return self._decoded(self._received(flags), Descriptors())
+        if not self._came:  # else a signal has ended the reading of what came last
+            self._received(flags)
+        packet, ancillary, _, _ = self._came[0]
+        return self._decoded(packet, _fds_of(ancillary))
+
+    def _received(self, flags: int) -> bytes:
+        """Receive a packet; where descriptors may come along, put it and these into ``_came``, in one step: a signal
+        behind it would leave descriptors that nobody knows, and with them a node open.
+        """
         try:
-            if self._passed:
-                packet, ancillary, _, _ = self._sock.recvmsg(MAX_PACKET, _ANCILLARY, flags | _CMSG_CLOEXEC)
-                fds = _fds_of(ancillary)
-            else:
-                packet = self._sock.recv(MAX_PACKET, flags)
+            if not self._passed:
+                return self._sock.recv(MAX_PACKET, flags)
+            self._came.extend(map(self._sock.recvmsg, (MAX_PACKET,), (_ANCILLARY,), (flags | _CMSG_CLOEXEC,)))
         except BlockingIOError:
             raise
         except OSError as error:
             raise self._gone(error, "receive") from None
-        return self._decoded(packet, fds)
+        return b""
 
     def _decoded(self, packet: bytes, fds: Descriptors) -> tuple[list, Descriptors]:  # type: ignore[type-arg]
         if not packet:

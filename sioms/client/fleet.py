@@ -12,7 +12,7 @@ from sioms.protocol.verbs import EmergencyStop
 
 from .cell_verbs import WorkcellVerbs
 from .channel import Answer, Call
-from .faces import Blocking, run
+from .faces import Blocking, begin, run
 from .fleet_places import wanted
 from .fleet_verbs import FleetError, FleetMarkerVerbs, FleetVerbs
 from .undisturbed import Undisturbed
@@ -145,7 +145,7 @@ class Fleet(Blocking, FleetVerbs[Workcell]):
         self, cells: Mapping[str, str] | Iterable[str] | str | None = None, name: str = "", *, partial: bool = False
     ) -> None:
         super().__init__(_Together(), name)
-        run(self._connect(wanted(cells), partial))
+        begin(self._connect, wanted(cells), partial)
 
     def __enter__(self) -> Self:
         return self

@@ -7,7 +7,7 @@ from sioms.protocol.socketpath import cell_address
 from .cell_verbs import NodeEntry, WorkcellVerbs, is_part
 from .channel import ENOUGH_LOOK_S, Channel
 from .connecting import CONNECT_S, connect_channel
-from .faces import Blocking, BlockingWaiter, run
+from .faces import Blocking, BlockingWaiter, begin
 from .node import NODE, Node
 from .session import MarkerVerbs
 from .title import title
@@ -49,7 +49,7 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
         path = path or cell_address()
         channel = connect_channel(path, CONNECT_S if enough is None else ENOUGH_LOOK_S)
         super().__init__(channel, BlockingWaiter(channel), path)
-        run(self._greet(title() if name is None else name, enough))
+        begin(self._greet, title() if name is None else name, enough)
 
     def _waiter_of(self, channel: Channel) -> BlockingWaiter:
         return BlockingWaiter(channel)
@@ -85,6 +85,6 @@ class Workcell(Blocking, WorkcellVerbs[Marker]):
         lease: float = 0.0,
         kind: type[Node[Any]] | None = None,
     ) -> Any:
-        return run(self._open(name, mode, timeout, lease, kind))
+        return begin(self._open, name, mode, timeout, lease, kind)
 
     open.__doc__ = WorkcellVerbs._open.__doc__
