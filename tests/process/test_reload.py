@@ -110,7 +110,7 @@ def test_what_has_not_changed_does_not_notice(daemon: Daemon) -> None:
             cell.reload()
             return bool(axis.statistics(1)["skipped"] == before)
 
-        grants = [f'[[grant]]\nusers = ["*"]\nrights = ["{right}"]\n' for right in ("read", "stop", "write")]
+        grants = [f'[[grant]]\nusers = ["*"]\nnodes = ["io{i}"]\nrights = ["read"]\n' for i in range(10)]
         assert any(loses_no_tick(grant) for grant in grants), "on a machine with too much to do it may, by itself"
         assert daemon.device("mod0")["pid"] == pid and axis.read().tick > page.tick, "the same process and page"
         axis.command(velocity=0.0)

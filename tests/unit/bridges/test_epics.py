@@ -26,6 +26,9 @@ from sioms.bridges.putters import Putters
 from sioms.protocol.flags import AnalogStatus, AxisStatus, NodeClass
 from sioms.protocol.nodeinfo import ChannelInfo, NodeInfo
 
+PATIENCE_S = 15.0
+"""As long as other tests wait for what only has to come [s]."""
+
 
 class Node:
     """An axis at rest, or that cannot be read."""
@@ -124,7 +127,7 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
     client: Context, bridge: epics.Bridge, cell: Cell
 ) -> None:
     def get(field: str) -> Any:
-        return client.get(f"lab:mod0:xaxis{field}", timeout=5.0)
+        return client.get(f"lab:mod0:xaxis{field}", timeout=PATIENCE_S)
 
     seen = {field: get(field) for field in (".RBV", ".VAL", "", ".VELO", ".LLM", ".HLM", ".DMOV", ".MOVN", ".EGU")}
     assert [*seen.values()] == [0.125, 0.25, 0.25, 0.25, -0.5, 0.5, 0, 1, "m"]
@@ -135,10 +138,10 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
 
     for field in ("", ".VAL", ".VELO", ".HLM"):
         with pytest.raises(RemoteError, match="only STOP can be put"):
-            client.put(f"lab:mod0:xaxis{field}", 0.3, timeout=5.0)
-    client.put("lab:mod0:xaxis.STOP", 0, timeout=5.0)
+            client.put(f"lab:mod0:xaxis{field}", 0.3, timeout=PATIENCE_S)
+    client.put("lab:mod0:xaxis.STOP", 0, timeout=PATIENCE_S)
     assert cell.node.stops == 0
-    client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
+    client.put("lab:mod0:xaxis.STOP", 1, timeout=PATIENCE_S)
     assert cell.node.stops == 1
     look(bridge)
     assert get(".DMOV") == 1
@@ -150,14 +153,14 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
     look(bridge)
     assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (2, "FAULT")
     with pytest.raises(RemoteError, match=r"put to lab:mod0:xaxis.STOP: stop mod0.readonly: no right to"):
-        client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
+        client.put("lab:mod0:xaxis.STOP", 1, timeout=PATIENCE_S)
 
     cell.node.lost = "its driver is gone"
     look(bridge)
     assert (get(".RBV").severity, get(".RBV").raw["alarm.message"]) == (3, "its driver is gone")
     assert get(".RBV") == 0.125
     cell.node.status = 0
-    client.put("lab:mod0:xaxis.STOP", 1, timeout=5.0)
+    client.put("lab:mod0:xaxis.STOP", 1, timeout=PATIENCE_S)
     assert cell.node.stops == 2, "also where it cannot be read"
     cell.node.lost = ""
     look(bridge)
@@ -167,24 +170,24 @@ def test_an_axis_is_seen_as_a_motor_with_alarms_and_stopped_by_a_put(
 def test_nan_stops_and_what_is_reloaded_or_gone_is_not_shown_as_before(
     client: Context, bridge: epics.Bridge, cell: Cell
 ) -> None:
-    client.put("lab:mod0:xaxis.STOP", float("nan"), timeout=5.0)
+    client.put("lab:mod0:xaxis.STOP", float("nan"), timeout=PATIENCE_S)
     assert cell.node.stops == 1
     with pytest.raises(RemoteError, match="with --move LEASE and VAL"):
-        client.put("lab:mod0:xaxis.VAL", 0.1, timeout=5.0)
+        client.put("lab:mod0:xaxis.VAL", 0.1, timeout=PATIENCE_S)
 
     cell.node.lost = "its driver is gone"
     look(bridge)
     cell.node.lost = ""
     cell.node.info.channels[0].unit = "rad"
     look(bridge)
-    assert client.get("lab:mod0:xaxis.RBV", timeout=5.0).raw["display.units"] == "rad"
+    assert client.get("lab:mod0:xaxis.RBV", timeout=PATIENCE_S).raw["display.units"] == "rad"
     cell.empty = True
     look(bridge)
     with pytest.raises(TimeoutError):
         client.get("lab:mod0:xaxis.RBV", timeout=0.1)
     cell.empty = False
     look(bridge)
-    assert client.get("lab:mod0:xaxis.RBV", timeout=5.0) == 0.125
+    assert client.get("lab:mod0:xaxis.RBV", timeout=PATIENCE_S) == 0.125
 
 
 def test_a_daemon_that_hangs_keeps_nobody_from_seeing_what_drivers_publish(
@@ -197,7 +200,7 @@ def test_a_daemon_that_hangs_keeps_nobody_from_seeing_what_drivers_publish(
     assert asked.wait(5.0)
     cell.node.moving = 0
     bridge.look()
-    assert client.get("lab:mod0:xaxis.DMOV", timeout=5.0) == 1
+    assert client.get("lab:mod0:xaxis.DMOV", timeout=PATIENCE_S) == 1
     hangs.set()
     asking.join()
 
@@ -222,11 +225,11 @@ def test_a_put_that_is_answered_shows(cell: Cell) -> None:
     bridge = epics.Bridge("", Putters(), Prompt(beats=False), held)  # type: ignore[arg-type]
     look(bridge)
     with serving(bridge) as client:
-        assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 1
-        client.put("mod0:xaxis.VAL", 0.1, timeout=5.0)
-        assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 0
-        client.put("mod0:xaxis.STOP", 1, timeout=5.0)
-        assert client.get("mod0:xaxis.DMOV", timeout=5.0) == 1
+        assert client.get("mod0:xaxis.DMOV", timeout=PATIENCE_S) == 1
+        client.put("mod0:xaxis.VAL", 0.1, timeout=PATIENCE_S)
+        assert client.get("mod0:xaxis.DMOV", timeout=PATIENCE_S) == 0
+        client.put("mod0:xaxis.STOP", 1, timeout=PATIENCE_S)
+        assert client.get("mod0:xaxis.DMOV", timeout=PATIENCE_S) == 1
 
 
 def mover() -> tuple[epics.Bridge, list[Any]]:
@@ -243,9 +246,9 @@ def test_axes_are_moved_only_on_request_and_only_from_this_machine(cell: Cell) -
     bridge, calls = mover()
     look(bridge)
     with serving(bridge) as client:
-        client.put("mod0.LEASE", 0.5, timeout=5.0)
-        client.put("mod0:xaxis.VAL", 0.1, timeout=5.0)
-        assert client.get("mod0.LEASE", timeout=5.0) == 0.5
+        client.put("mod0.LEASE", 0.5, timeout=PATIENCE_S)
+        client.put("mod0:xaxis.VAL", 0.1, timeout=PATIENCE_S)
+        assert client.get("mod0.LEASE", timeout=PATIENCE_S) == 0.5
     who = calls[0][1]
     assert "@127.0.0.1:" in who
     assert calls == [("mod0", who, 0.5), ("mod0", who, "xaxis", 0.1)]
@@ -274,7 +277,7 @@ def test_a_put_that_waits_behind_another_came_before_and_keeps_up_no_stop(cell: 
             thread.start()
             time.sleep(0.3)
         assert len(words) == 1, "the second one waits"
-        client.put("mod0:xaxis.STOP", 1, timeout=5.0)
+        client.put("mod0:xaxis.STOP", 1, timeout=PATIENCE_S)
         assert cell.node.stops == 1
         reset_ns = time.monotonic_ns()
         go_on.set()
@@ -324,10 +327,10 @@ from p4p.client.thread import Context, RemoteError
 os.setuid({STRANGER})
 conf = {{"EPICS_PVA_NAME_SERVERS": "{place}", "EPICS_PVA_ADDR_LIST": "", "EPICS_PVA_AUTO_ADDR_LIST": "NO"}}
 with Context("pva", conf=conf, useenv=False) as context:
-    print("read", float(context.get("mod0:xaxis.RBV", timeout=5.0)))
+    print("read", float(context.get("mod0:xaxis.RBV", timeout=15.0)))
     for name, value in {puts!r}:
         try:
-            context.put(name, value, timeout=5.0)
+            context.put(name, value, timeout=15.0)
         except RemoteError as error:
             print(error)
 """
