@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sioms.reconcile.conclude import dwarfed, formulas
 from sioms.reconcile.fit import Problem
 from sioms.reconcile.form import of_any_form
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.refusals import dwarfed, formulas
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.simulate import replay, simulate
 from sioms.reconcile.swings import swinging

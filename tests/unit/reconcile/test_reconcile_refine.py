@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sioms.reconcile.conclude import needed
 from sioms.reconcile.fit import Problem, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.noise import observer
 from sioms.reconcile.prepare import Options, Prepared, prepare
 from sioms.reconcile.records import Record, Session
 from sioms.reconcile.refine import ahead, bounded, nearest, runs_away, settled
+from sioms.reconcile.refusals import needed
 from sioms.reconcile.simulate import pack, released
 from sioms.reconcile.thresholds import WITHIN
 

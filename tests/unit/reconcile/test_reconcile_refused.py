@@ -12,11 +12,11 @@ import pytest
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.axis_verdict import AxisVerdict
-from sioms.reconcile.conclude import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, as_stated, doubted, formulas, refused
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.model_file import parse_model, write_model
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Session
+from sioms.reconcile.refusals import REFUSED_BEYOND, REFUSED_BOUND, REFUSED_FREE, as_stated, doubted, formulas, refused
 from sioms.reconcile.report.page import page
 from sioms.reconcile.report.words import as_json, summary
 from sioms.reconcile.verdict import Candidate, Estimate, NamedEffect, Outcome

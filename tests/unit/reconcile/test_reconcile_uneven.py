@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from sioms.reconcile.axis import analyse
-from sioms.reconcile.conclude import another_law
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Problem, refit
 from sioms.reconcile.model import AxisModel, Controller
 from sioms.reconcile.noise import drive_noise, observer, sensor_noise
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.records import Record, Session
+from sioms.reconcile.refusals import another_law
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile.uneven import Uneven, uneven
 from sioms.reconcile.verdict import NamedEffect, Outcome
