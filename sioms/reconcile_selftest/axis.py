@@ -34,7 +34,7 @@ class Axis:
     """One axis and what it hides.
 
     Attributes:
-        kind: null, single, multi, confounded or unknown.
+        kind: null, single, multi, confounded, unknown or near.
         current, marks: whether the drive's current and index marks are recorded.
         seed: of its commands and noise.
         named, nameless: hidden effects with their parameters.

@@ -12,6 +12,8 @@ import numpy as np
 
 from sioms.reconcile_selftest.axis import Axis, Numbers, Servo
 from sioms.reconcile_selftest.commands import REACH, commands
+from sioms.reconcile_selftest.near import BESIDE as BESIDE_NEAR
+from sioms.reconcile_selftest.near import NEAR, draw_near
 from sioms.reconcile_selftest.world import World
 
 #: What may be confounded with what under which poor excitation, or for want of which channel.
@@ -103,6 +105,7 @@ BESIDE = {
     "falling_drag": ("coulomb", "payload"),
     "stop": ("coulomb", "viscous"),
     "detent": ("viscous", "payload"),
+    **BESIDE_NEAR,
 }
 #: Only a measured current, or index marks, tell these from their look-alikes.
 BY_CURRENT, BY_MARKS = {"delay", "lag", "saturation"}, {"payload", "encoder_scale"}
@@ -154,9 +157,15 @@ def _sound(axis: Axis) -> bool:
         behind = np.array([r.force_measured - r.force for r in runs[:4]])
         if float(np.sqrt(np.mean(behind**2))) < BEHIND * axis.rated:
             return False
+    if "near_heat" in axis.nameless and not WARM[0] < _lost(axis.nameless["near_heat"], world.heat) < WARM[1]:
+        return False
     if "thermal_gain" in axis.named and not WARM[0] < axis.named["thermal_gain"]["loss"] * world.heat < WARM[1]:
         return False
     return axis.excitation != "small" or float(np.max(place[:4])) < SMALL
+
+
+def _lost(numbers: Numbers, heat: float) -> float:
+    return numbers["size"] * heat / (1.0 + heat / numbers["more"])
 
 
 def _drawn(name: str, kind: str, rng: np.random.Generator, only: str) -> Axis:
@@ -175,7 +184,7 @@ def _drawn(name: str, kind: str, rng: np.random.Generator, only: str) -> Axis:
     elif kind == "confounded":
         hidden, rival = (str(p) for p in rng.permutation(CONFOUNDED[excitation]))
         named = [hidden]
-    elif kind == "unknown":
+    elif kind in ("unknown", "near"):
         nameless = [only or _pick((*NAMELESS, *UNMET), axis, rng)]
         beside = BESIDE.get(nameless[0], ())
         named = [str(rng.choice(beside))] if beside and rng.random() < 0.5 else []
@@ -316,6 +325,8 @@ def _effect(name: str, axis: Axis, rng: np.random.Generator) -> Numbers:
         """Of an angle, or of a short pitch that goes by many times a second."""
         return float(rng.integers(low, high)) if axis.rotary else float(rng.integers(1, 7))
 
+    if name in NEAR:
+        return draw_near(name, f, v, reach, order(2, 13), rng)
     phase, sign, fc = u(-np.pi, np.pi), float(rng.choice([-1, 1])), f * u(0.06, 0.2)
     fs, vs = fc * u(1.6, 2.4), v * u(0.015, 0.05)
     yields = max(x * u(5e-4, 3e-3), 4.0 * q)

@@ -98,7 +98,7 @@ def is_right(hidden: Hidden, answer: Mapping[str, Any]) -> bool:
             sets = [got, *(set(a) for a in answer["alternatives"])]
             both = truth in sets and set(hidden.rival.split(" + ")) in sets
             return verdict == "ambiguous" and both and bool(answer["separating_experiment"])
-        case "unknown":
+        case "unknown" | "near":
             return verdict == "unexplained" and got == truth
         case _:
             return verdict == "named" and got == truth
@@ -167,6 +167,7 @@ def table(rows: Sequence[Scored]) -> str:
         ("precision over effects", f"{hits}/{named}"),
         ("recall over effects", f"{hits}/{hidden}"),
         ("outside the library: refused, known part right", share("unknown")),
+        ("near a form of the library: refused, known part right", share("near")),
         ("confounded: both named", share("confounded")),
         ("gap closed, median", quantile(closed, 0.5)),
         ("gap closed, tenth percentile", quantile(closed, 0.1)),

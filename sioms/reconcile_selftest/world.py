@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.signal import lfilter
 
 from sioms.reconcile_selftest.axis import Array, Axis
+from sioms.reconcile_selftest.near import BUILD, ELEMENTS, HEAT, NEAR, near_force, near_level
 
 STEP_S = 1e-5
 #: Samples of command before the first, for what comes late.
@@ -45,6 +46,7 @@ class Plant(NamedTuple):
     inertia: float
     viscous: float
     rated: float
+    speed: float
     pitch: float
     resolution: float
     k: float
@@ -139,17 +141,25 @@ class Plant(NamedTuple):
     interpolation_error_amp: float = 0.0
     interpolation_error_n: float = 0.0
     interpolation_error_phase: float = 0.0
+    near_kind: int = -1
+    near_size: float = 0.0
+    near_scale: float = 1.0
+    near_shape: float = 1.0
+    near_more: float = 0.0
+    near_phase: float = 0.0
     knocks_height: float = 0.0
     knocks_count: float = 0.0
 
 
 def _plant(axis: Axis) -> Plant:
     servo, dt = axis.servo, axis.sample_s
+    effects = {"near" if n in NEAR else n: numbers for n, numbers in axis.hidden.items()}
     return Plant(
         sample_s=dt,
         inertia=axis.inertia,
         viscous=axis.viscous,
         rated=axis.rated,
+        speed=axis.speed,
         pitch=axis.pitch,
         resolution=axis.resolution,
         k=servo.k,
@@ -159,7 +169,8 @@ def _plant(axis: Axis) -> Plant:
         top=servo.limit,
         filter_share=1.0 - float(np.exp(-2.0 * np.pi * servo.filter_hz * dt)) if servo.filter_hz > 0 else 1.0,
         mean=float(servo.mean),
-        **{f"{effect}_{s}": float(v) for effect, numbers in axis.hidden.items() for s, v in numbers.items()},
+        near_kind=next((NEAR.index(n) for n in axis.nameless if n in NEAR), -1),
+        **{f"{effect}_{s}": float(v) for effect, numbers in effects.items() for s, v in numbers.items()},
     )
 
 
@@ -268,6 +279,8 @@ def _march(
     slid, fall = p.lugre_Fc + p.presliding_Fc, p.lugre_vs
     s0 = held / (p.lugre_xs if p.lugre_Fs > 0.0 else p.presliding_xs)
     s1 = 0.1 * np.sqrt(s0 * motor)
+    near = (p.near_size, p.near_scale, p.near_shape, p.near_more, p.near_phase)
+    way, yields = 0.0, np.zeros(ELEMENTS)
     x = v = xl = vl = z = bristle = hyst = lagged = 0.0
     e_old = u_old = y_old = y_older = speed = slewed = 0.0
     for i in range(len(command)):
@@ -327,6 +340,19 @@ def _march(
             level += p.stribeck_Fc + (p.stribeck_Fs - p.stribeck_Fc) * np.exp(-((v / p.stribeck_vs) ** 2))
             level += p.load_friction_mu * abs(drive) + p.load_square_friction_g * drive * drive
             level += p.warming_friction_g * heat
+            if p.near_kind == HEAT:
+                heat += h / p.near_scale * ((drive / p.rated) ** 2 - heat)
+            if p.near_kind >= 0:
+                way += abs(v) * h / p.speed
+                f += near_force(p.near_kind, near, x, v, drive, theta, heat)
+                level += near_level(p.near_kind, near, v, drive, theta, way, (i + s / sub) * p.sample_s)
+            if p.near_kind == BUILD:
+                for j in range(ELEMENTS):
+                    most = p.near_scale * p.near_shape**j
+                    yields[j] = min(max(yields[j] + v * h, -most), most)
+                    f -= p.near_size / ELEMENTS * yields[j] / most
+                    if abs(yields[j]) < most:
+                        f -= 0.3 * np.sqrt(p.near_size / ELEMENTS / most * motor) * v
             varied = 1.0 + p.friction_variation_depth * np.sin(
                 p.friction_variation_n * theta + p.friction_variation_phase
             )

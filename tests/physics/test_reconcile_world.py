@@ -10,14 +10,15 @@ import pytest
 
 from sioms.reconcile.axis import analyse
 from sioms.reconcile.axis_verdict import AxisVerdict
-from sioms.reconcile.command.selftest import record, write_public
+from sioms.reconcile.command.selftest import generate, record, write_public
 from sioms.reconcile.effects import library
 from sioms.reconcile.files.axis import read_data, read_model
 from sioms.reconcile.prepare import Options
 from sioms.reconcile.verdict import Outcome
+from sioms.reconcile_selftest import near
 from sioms.reconcile_selftest.axis import Axis, Servo
 from sioms.reconcile_selftest.draw import NAMED, SATURATED, draw_axis
-from sioms.reconcile_selftest.score import PRIMARY
+from sioms.reconcile_selftest.score import PRIMARY, is_right
 from sioms.reconcile_selftest.world import Recording, World
 
 #: An axis of 2 kg without friction, on a soft spring of a controller.
@@ -173,3 +174,35 @@ def test_a_drive_saturates_in_some_of_the_samples() -> None:
     axis = draw_axis("a", "single", np.random.default_rng(3), "saturation")
     beyond = [np.abs(r.force) > axis.named["saturation"]["limit"] for r in record(axis)]
     assert SATURATED[0] < np.mean(beyond) < SATURATED[1]
+
+
+NEAR = {"size": 1.0, "scale": 0.01, "shape": 2.0, "more": 1.0, "phase": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("hidden", "named"),
+    [
+        ({"near_drop": NEAR}, {"stribeck": {"Fc": 1.0, "Fs": 2.0, "vs": 0.01}}),
+        ({"near_load": {**NEAR, "scale": 20.0, "shape": 1.0}}, {"load_friction": {"mu": 0.05}}),
+        ({"near_heat": {**NEAR, "scale": 5.0, "more": 1e9}}, {"thermal_gain": {"loss": 1.0, "tau": 5.0}}),
+        ({"near_spring": {**NEAR, "scale": 1e6, "size": 2e8}}, {"spring": {"k": 200.0}}),
+        ({"near_drag": {**NEAR, "scale": 1e6, "size": 8e6}}, {"viscous": {"b_extra": 8.0}}),
+    ],
+    ids=["drop", "load", "heat", "spring", "drag"],
+)
+def test_a_form_near_the_library_becomes_that_of_the_library(
+    hidden: dict[str, dict[str, float]], named: dict[str, dict[str, float]]
+) -> None:
+    """... where its shape is that, so that it is the shape alone in which it differs."""
+    t = np.arange(1500) * 1e-3
+    command = 0.02 * np.sin(2 * np.pi * 2.0 * t) * np.minimum(t / 0.2, 1.0)
+    other = World(replace(BARE, nameless=hidden)).record(command, noise=0.0)
+    assert np.allclose(other.force, run(command, **named).force, atol=2e-3 * np.max(np.abs(other.force)))
+
+
+def test_forms_near_the_library_are_drawn_anew_and_held_by_their_loops() -> None:
+    drawn = generate(10, 3, near=True)
+    assert [a.kind for a in drawn] == ["near"] * 10
+    assert {name for a in drawn for name in a.nameless} == set(near.NEAR)
+    assert not is_right(drawn[0], {"verdict": "named", "effects": [*drawn[0].named, "coulomb"]})
+    assert is_right(drawn[0], {"verdict": "unexplained", "effects": [*drawn[0].named]})

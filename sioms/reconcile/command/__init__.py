@@ -67,6 +67,7 @@ def add_parser(subparsers: Any) -> argparse.ArgumentParser:
         default=0,
         help="additional diagnoses of each with resampled blocks",
     )
+    test.add_argument("--near", action="store_true", help="hide forms near those of the library; none may be named")
     test.add_argument("--damaged", action="store_true", help="damage the data in many ways; nothing may be named")
     watch.add_parser(kinds)
     effects = kinds.add_parser("effects", help="print the library of effects")
@@ -102,7 +103,7 @@ def run(args: argparse.Namespace) -> int:
     if args.subject == "selftest":
         from sioms.reconcile.command.selftest import selftest
 
-        return selftest(args.axes, args.seed, args.out, args.jobs, args.replicates)
+        return selftest(args.axes, args.seed, args.out, args.jobs, args.replicates, args.near)
     if args.subject == "score":
         from sioms.reconcile.command.score import score
 

@@ -13,13 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from sioms.reconcile.command.blind import in_turn, judge_all, solve
+from sioms.reconcile.command.blind import MIXTURE, in_turn, judge_all, solve
 from sioms.reconcile.files.axis import read_model
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.simulate import simulate
 from sioms.reconcile_selftest.axis import Axis
 from sioms.reconcile_selftest.commands import commands
 from sioms.reconcile_selftest.draw import CONFOUNDED, NAMED, NAMELESS, UNMET, draw_axis
+from sioms.reconcile_selftest.near import NEAR
 from sioms.reconcile_selftest.score import Scored, score
 from sioms.reconcile_selftest.world import Recording, World
 
@@ -34,11 +35,16 @@ force = { name = "force" }
 CURRENT, MARKS = 'force_measured = { name = "force_measured" }\n', 'index = { name = "index" }\n'
 
 
-def generate(count: int, seed: int) -> list[Axis]:
-    """Draw the axes of a test; every effect comes up in turn."""
+def generate(count: int, seed: int, near: bool = False) -> list[Axis]:
+    """Draw the axes of a test; every effect comes up in turn.
+
+    Args:
+        near: hide forms near those of the library, and nothing else, on all of them.
+    """
     rng = np.random.default_rng(seed)
-    effects = {"single": NAMED, "unknown": (*NAMELESS, *UNMET), "confounded": CONFOUNDED}
-    return [draw_axis(f"axis{i:03d}", kind, rng, only) for i, kind, only in in_turn(count, rng, effects)]
+    effects = {"single": NAMED, "unknown": (*NAMELESS, *UNMET), "confounded": CONFOUNDED, "near": NEAR}
+    drawn = in_turn(count, rng, effects, ("near",) if near else MIXTURE)
+    return [draw_axis(f"axis{i:03d}", kind, rng, only) for i, kind, only in drawn]
 
 
 def record(axis: Axis, seconds: float = RECORD_S, heldout: bool = False) -> list[Recording]:
@@ -105,19 +111,22 @@ def write_public(axis: Axis, recordings: list[Recording], folder: Path) -> None:
     (folder / "nominal.toml").write_text("\n".join(lines) + "\n")
 
 
-def selftest(count: int, seed: int, out: Path | None = None, jobs: int = 0, replicates: int = 0) -> int:
+def selftest(
+    count: int, seed: int, out: Path | None = None, jobs: int = 0, replicates: int = 0, near: bool = False
+) -> int:
     """Run the blind test and print the table.
 
     Args:
         out: keep the axes and the answers here.
         jobs: solvers at a time; 0 takes one for each core.
         replicates: solve every axis so many times more with its blocks of time drawn anew.
+        near: as of ``generate``.
 
     Returns:
         0 when at least nine tenths of the axes were judged right, else 1.
     """
     print(f"drawing {count} axes", file=sys.stderr, flush=True)
-    axes = generate(count, seed)
+    axes = generate(count, seed, near)
 
     def judge(axis: Axis, folder: Path) -> Scored:
         records = record(axis, heldout=True)
