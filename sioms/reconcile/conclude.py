@@ -4,13 +4,14 @@ next.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.axis_verdict import AxisVerdict
+from sioms.reconcile.bends import Bend, bent, loosened
 from sioms.reconcile.bounces import deepest, rattles
 from sioms.reconcile.controlled import foreign
 from sioms.reconcile.disturbance import disturbance
@@ -46,7 +47,7 @@ from sioms.reconcile.refusals import (
     idle,
     refused,
 )
-from sioms.reconcile.remarks import of_bursts, of_change, of_doubts, of_inertia, of_much
+from sioms.reconcile.remarks import of_bend, of_bursts, of_change, of_doubts, of_hanging, of_inertia, of_much
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
 from sioms.reconcile.thresholds import (
@@ -82,6 +83,10 @@ LAST = 12
 PAYLOAD = "payload"
 
 
+#: Intervals by (effect, symbol).
+Spans = dict[tuple[str, str], tuple[float, float]]
+
+
 @dataclass(frozen=True, slots=True)
 class Searched:
     """What a search ended with.
@@ -113,7 +118,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     gaps, judged = _gaps(s, states, rng)
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
-    spans = spans_of(whole, fit, others_as_deep)
+    tight = spans_of(whole, fit, others_as_deep)
+    spans = _with_room(tight, whole, fit, s.searcher.frozen)
     ends = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
     travel = max(high for _, high in ends) - min(low for low, _ in ends)
     told = describe(ready.findings, fit, found, s.searcher, others, spans, rng)
@@ -136,7 +142,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     wave = locked(ready.problem, found.fit)
     missing = missing or (wave is not None and wave.share > (MOSTLY_LOCKED if named else LOCKED))
     changing = [] if missing else _changing(s, named)
-    missing = missing or bool(changing)
+    turned = [] if missing else _turned(s, named)
+    missing = missing or bool(changing) or bool(turned)
     drives = [f.effect for f in ready.findings if f.doubted]
     said = outcome(bool(named), missing, bool(open_rivals) or blindly or bool(drives))
     gaps = tuple(_told(g, said is Outcome.UNEXPLAINED) for g in gaps)
@@ -156,10 +163,11 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
             notes += [text for text in (friction_told(whole, fit),) if text]
             named = [_at_rest(e, whole, fit, notes) for e in named]
     notes += [of_change(known()[c.effect].title, c, ratio) for c in changing]
+    notes += [of_bend(known()[b.effect].title, b) for b in turned]
     if ready.blind:
         notes.insert(0, remark(nominal))
     tried = refused(named, leaning, bool(judged.refusals), beyond)
-    tried += another_law(named, changing)
+    tried += another_law(named, changing, turned)
     if judged.refusals:
         tried += tuple(Candidate(e.name, e.title, REFUSED_FREE) for e in terms if e.name in fit.model.effects)
     elif said is Outcome.UNEXPLAINED and not rattles(fit.model):
@@ -184,10 +192,12 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     searched_for = [e for e in found_here if e.name not in s.searcher.frozen]
     # beside a gap the remainder is of bounces, which no other effect can be
     doubtful = [] if rattles(found.fit.model) else [e.name for e in searched_for if doubted(e, ratio)]
-    if doubtful and said in (Outcome.NAMED, Outcome.AMBIGUOUS):
-        said = Outcome.AMBIGUOUS
-        others_said = (*others_said, tuple(e.name for e in found_here if e.name not in doubtful))
-        notes.append(of_doubts([e.title for e in found_here if e.name in doubtful]))
+    hanging = [e.name for e in searched_for if e.name not in doubtful and _hangs(e.name, tight, spans)]
+    for doubts, of in ((doubtful, of_doubts), (hanging, of_hanging)):
+        if doubts and said in (Outcome.NAMED, Outcome.AMBIGUOUS):
+            said = Outcome.AMBIGUOUS
+            others_said = (*others_said, tuple(e.name for e in found_here if e.name not in doubts))
+            notes.append(of([e.title for e in found_here if e.name in doubts]))
     places, spectrum, traces = pictures(ready, nominal, found.fit.model, o, rng)
     return AxisVerdict(
         outcome=said,
@@ -225,6 +235,39 @@ def _changing(s: Searched, named: Sequence[NamedEffect]) -> list[Uneven]:
     if s.searcher.done(fit) or rattles(fit.model):
         return []
     return uneven(s.ready.problem, fit, [e.name for e in named if e.name not in s.searcher.frozen])
+
+
+def _turned(s: Searched, named: Sequence[NamedEffect]) -> list[Bend]:
+    """Return what is named whose exponents are others; beside a gap the remainder is of bounces."""
+    fit = s.found.fit
+    if rattles(fit.model):
+        return []
+    return bent(s.ready.problem, fit, [e.name for e in named if e.name not in s.searcher.frozen])
+
+
+def _with_room(spans: Spans, whole: Problem, fit: Fit, frozen: Sequence[str]) -> Spans:
+    """Widen intervals by what exponents that the records do not tell leave open."""
+    if rattles(fit.model):
+        return spans
+    room = loosened(whole, fit, [n for n in fit.model.effects if n not in frozen])
+    return _widened(spans, room)
+
+
+def _widened(spans: Spans, room: Mapping[tuple[str, str], float]) -> Spans:
+    return {key: _wide(span, room.get(key, 0.0)) for key, span in spans.items()}
+
+
+def _hangs(name: str, tight: Spans, wide: Spans) -> bool:
+    """Say whether an effect may be none for no other reason than what exponents leave open."""
+    effect = known()[name]
+    key, nothing = (name, effect.primary.symbol), effect.neutral
+    return key in tight and not tight[key][0] <= nothing <= tight[key][1] and wide[key][0] <= nothing <= wide[key][1]
+
+
+def _wide(span: tuple[float, float], room: float) -> tuple[float, float]:
+    middle, half = 0.5 * (span[0] + span[1]), 0.5 * (span[1] - span[0])
+    half = float(np.hypot(half, room))
+    return middle - half, middle + half
 
 
 def _alternatives(

@@ -10,6 +10,7 @@ from dataclasses import replace
 import numpy as np
 
 from sioms.reconcile.ambiguity import lookalikes
+from sioms.reconcile.bends import Bend
 from sioms.reconcile.effect import Over
 from sioms.reconcile.effects import known
 from sioms.reconcile.effects.smooth import CONSTANT, LAWS, SIDE
@@ -20,6 +21,8 @@ from sioms.reconcile.uneven import Uneven
 from sioms.reconcile.variation import named as varied
 from sioms.reconcile.verdict import Candidate, NamedEffect
 
+#: A drop with the speed: beside a law of the speed it is a part of that.
+DROPS = "stribeck"
 #: Why an effect of the model is no finding.
 REFUSED_FREE = "the model with it does not move as the machine did"
 REFUSED_BEYOND = "too much remains beside it for a part to be told"
@@ -27,16 +30,20 @@ REFUSED_IDLE = "held-out samples are met as well without it: it may stand for a 
 REFUSED_SMALL = "beside a formula without a name that explains far more it may be what that formula lacks"
 REFUSED_BOUND = "a number of it is at the end of what it can be: it stands for something else"
 REFUSED_UNEVEN = "its numbers are not the same everywhere, they change with {}: its law is another one"
+REFUSED_BENT = "its {} comes to another value than that of the law: its law is another one"
+REFUSED_HANGS = "how large it is hangs on a law that is another one"
 REFUSED_ALIKE = "the law of what it looks like is another one, and it may make up for that"
 
 
-def another_law(named: Sequence[NamedEffect], changing: Sequence[Uneven]) -> tuple[Candidate, ...]:
-    """Refuse the names whose numbers change, and those that look like them."""
-    why = {c.effect: REFUSED_UNEVEN.format(c.variable) for c in changing}
-    alike = {other for name in why for other in lookalikes(name)}
-    return tuple(
-        Candidate(e.name, e.title, why.get(e.name, REFUSED_ALIKE)) for e in named if e.name in alike.union(why)
-    )
+def another_law(
+    named: Sequence[NamedEffect], changing: Sequence[Uneven], turned: Sequence[Bend] = ()
+) -> tuple[Candidate, ...]:
+    """Refuse the names whose numbers or exponents are others, those that look like them and what hangs on them."""
+    laws = {c.effect: REFUSED_UNEVEN.format(c.variable) for c in changing}
+    laws |= {b.effect: REFUSED_BENT.format(b.what) for b in turned}
+    alike = {other: REFUSED_ALIKE for name in laws for other in lookalikes(name)}
+    why = alike | {name: REFUSED_HANGS for b in turned for name in b.hangs} | laws
+    return tuple(Candidate(e.name, e.title, why[e.name]) for e in named if e.name in why)
 
 
 def doubted(effect: NamedEffect, ratio: float) -> bool:
@@ -79,6 +86,8 @@ def formulas(
     within = {n for law in laws for n in (*law.replaces, CONSTANT.get(law.name, ""))} | set(changing)
     if any(law.over is Over.PLACE for law in laws):
         within |= {e.name for e in named if _seldom(e, pitches)}
+    if any(law.over is Over.SPEED for law in laws):
+        within |= {e.name for e in named if e.name == DROPS}
     parts = [replace(e, title=e.equation) for e in named if e.name in within]
     return [e for e in named if e.name not in within], [*terms, *parts]
 

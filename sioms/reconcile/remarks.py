@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from scipy.stats import binom
 
+from sioms.reconcile.bends import Bend
 from sioms.reconcile.fit import Fit, Problem
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.refuse import loud_turns
@@ -20,10 +21,25 @@ def of_change(title: str, change: Uneven, ratio: float) -> str:
     )
 
 
+def of_bend(title: str, b: Bend) -> str:
+    way = "higher" if b.change > 0.0 else "lower"
+    return (
+        f"{title}: where all numbers may follow, its {b.what} comes out {way} than that of the law "
+        f"({b.errors:.1f} standard errors); its law is another one"
+    )
+
+
 def of_doubts(titles: Sequence[str]) -> str:
     return (
         f"{' and '.join(titles)}: less is explained by it than remains above the noise, so it may be a part of what "
         "remains; the model without it is as likely"
+    )
+
+
+def of_hanging(titles: Sequence[str]) -> str:
+    return (
+        f"{' and '.join(titles)}: how large it is hangs on the exponents of the laws beside it, which these records do "
+        "not tell; with neighbours of theirs there may be none"
     )
 
 

@@ -267,7 +267,19 @@ UNEVEN, UNEVEN_PATH = 0.08, 0.5
 """What is named has another law where the first share of what remains is explained, surely, once its numbers may change
 with a variable; of friction that builds up over a path, the second. Some hundred axes fitted with the right effects
 (seeds 981601 to 981604 and the forty): 0.06 at most, of friction that builds up 0.36; fifteen look-alikes in the place
-of other laws: 0.08 to 0.98, of friction that builds up 0.62 to 0.77 (1056)."""
+of other laws: 0.08 to 0.98, of friction that builds up 0.62 to 0.77 (1056). Seed 770003, not seen when they were set:
+42 right axes 0.01 at most, of friction that builds up 0.28; of 24 near laws (seed 770004) 15 are beyond (1053)."""
+
+EXPONENT, EXPONENT_PATH, EXPONENT_ERRORS = 0.1, 0.3, 3.0
+"""What is named has another law where its exponent comes to another value by the first number at least, beside friction
+that builds up over a path by the second, and by so many standard errors. Eighty-one drawn axes fitted with the right
+effects (seeds 770002 and 770003): 0.012 at most at three standard errors, beside what builds up 0.11; look-alikes in
+the place of forty near laws (seed 770004), 32 fits of 50: 0.14 and more (1053)."""
+NEIGHBOUR, HANGS = 0.5, 0.1
+"""The neighbours of a law differ from it in its exponent by the first number (one standard deviation: a drop with the
+speed itself for one with its square is two), which intervals have room for. Chosen. An effect whose size changes by
+the second share with a bend is refused with the law that is bent. Chosen: what changes by less is told as wide (1053).
+"""
 
 # --- what keeps time
 

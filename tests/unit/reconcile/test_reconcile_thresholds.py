@@ -36,3 +36,17 @@ def test_no_module_has_a_threshold_of_its_own_by_a_name_of_the_table() -> None:
         if name in table and not (isinstance(node, ast.Assign) and isinstance(node.value, ast.Call | ast.Attribute))
     }
     assert not elsewhere
+
+
+def test_no_name_stands_twice_in_the_table() -> None:
+    """The second would be that of the first, too."""
+    body = ast.parse(Path(thresholds.__file__).read_text()).body
+    names = [
+        n.id
+        for a in body
+        if isinstance(a, ast.Assign)
+        for t in a.targets
+        for n in ast.walk(t)
+        if isinstance(n, ast.Name)
+    ]
+    assert sorted(names) == sorted(set(names))
