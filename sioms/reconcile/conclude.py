@@ -50,6 +50,7 @@ from sioms.reconcile.refusals import (
 from sioms.reconcile.remarks import of_bend, of_bursts, of_change, of_doubts, of_hanging, of_inertia, of_much
 from sioms.reconcile.search import Found, Searcher
 from sioms.reconcile.session import State
+from sioms.reconcile.steps import halved
 from sioms.reconcile.thresholds import (
     AXIS,
     BURSTS,
@@ -118,7 +119,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     gaps, judged = _gaps(s, states, rng)
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
-    tight = spans_of(whole, fit, others_as_deep)
+    fit, changed = (fit, {}) if rattles(fit.model) else halved(whole, fit, s.searcher.frozen)
+    tight = _widened(spans_of(whole, fit, others_as_deep), changed)
     spans = _with_room(tight, whole, fit, s.searcher.frozen)
     ends = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
     travel = max(high for _, high in ends) - min(low for low, _ in ends)

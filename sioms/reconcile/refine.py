@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sioms.reconcile.effect import Array
+from sioms.reconcile.effect import Array, Ref
 from sioms.reconcile.effects import known
 from sioms.reconcile.engine.fit import BASE, Free, fitted, get, put
 from sioms.reconcile.fit import Fit, Problem, closed_errors, free_parameters, refit
@@ -29,13 +29,16 @@ TIMES = 3
 
 def bounded(model: AxisModel) -> AxisModel:
     """Return the model with the bounds that its refined inertia has during a search, and those of effects that it
-    states larger than any is sought: a fit that begins outside its bounds goes nowhere.
+    states about as large as any is sought, or larger: a fit that begins outside its bounds goes nowhere, and one that
+    begins just inside runs into them.
     """
     within = {"inertia": (model.inertia / WITHIN, model.inertia * WITHIN)} if "inertia" in model.refine else {}
     for name, given in model.effects.items():
         for p in (q for q in known()[name].parameters if not q.phase and not q.fixed):
             (low, high), stated = model.bounds(name, p), given[p.symbol]
-            if not low <= stated <= high:
+            # a size may be refined as an inertia may; shares, times and speeds of a bend have bounds for what they are
+            most = WITHIN * stated if p is known()[name].primary and p.ref not in (Ref.ONE, Ref.TIME) else stated
+            if not (low <= stated <= high and low <= most <= high):
                 within[f"{name}.{p.symbol}"] = (min(low, WITHIN * stated), max(high, WITHIN * stated))
     return replace(model, within=within)
 
