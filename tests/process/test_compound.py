@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import random
 import signal
 import time
 import tomllib
@@ -191,6 +192,41 @@ def test_arm_and_mill_move_the_simulated_axes_of_their_examples(
                 lambda: np.allclose([at for one in below for at in one.read().position], joints, atol=5e-4),
                 "its axes are where the map says",
             )
+
+
+@pytest.mark.parametrize(
+    ("name", "middle", "reach"),
+    [("slits", [0.0, 0.05], [0.02, 0.02]), ("mill", [0.03, 0.02, 0.15, 0.2, -0.5], [0.03, 0.03, 0.03, 0.1, 0.2])],
+)
+def test_what_a_compound_tells_at_rest_stands_where_it_is_told(
+    start_daemon: Callable[..., Daemon], name: str, middle: list[float], reach: list[float]
+) -> None:
+    """Moves, turns and stops at random instants: at their ends it stands, and so do the axes that it holds."""
+    text = (EXAMPLES / f"{name}.toml").read_text(encoding="utf-8")
+    daemon = start_daemon(text.replace('driver = "sim-axes"', 'driver = "sim-axes"\nlate_max_s = 0.5'))
+    chance, held = random.Random(1), tomllib.loads(text)["device"][name]["axes"]
+    with daemon.cell() as cell:
+        daemon.wait_up(name)
+        below = [cell.open(f"{one}.readonly", "r") for one in held]
+        with cell.open(name, "rw", timeout=10.0) as node:
+            wait_for(lambda: reads(node), "it has found its axes")
+            limits = np.array([channel.limits["velocity"] for channel in node.info.channels])
+            for what in ("move", "move", "stop", "turn", "stop", "turn", "stop", "move"):
+                _all(node, [m + chance.uniform(-r, r) for m, r in zip(middle, reach, strict=True)])
+                if what != "move":
+                    time.sleep(chance.uniform(0.0, 0.4))
+                if what == "turn":
+                    goal = [m + chance.uniform(-r, r) for m, r in zip(middle, reach, strict=True)]
+                    node.write([sioms.command(i, position=at) for i, at in enumerate(goal)], replace=True)
+                elif what == "stop":
+                    node.stop()
+                node.wait_until_idle(20.0)
+                told, stood = node.read(), [at for one in below for at in one.read().position]
+                assert not any(told.in_motion) and (np.abs(told.velocity) < 0.1 * limits).all(), what
+                time.sleep(0.2)
+                off = np.abs(np.array(node.read().position) - np.array(told.position))
+                assert (off < 2e-3 * limits).all(), (what, off)
+                assert np.allclose([at for one in below for at in one.read().position], stood, atol=2e-3), what
 
 
 def _all(node: sioms.Node, position: list[float]) -> None:
