@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import sys
 
 from sioms.protocol.text import printable
@@ -17,7 +18,11 @@ def title() -> str:
     if first == "-c":
         at = len(sys.orig_argv) - len(sys.argv)  # what is behind the code is the program's own
         code = sys.orig_argv[at].removeprefix("-c") if 0 < at < len(sys.orig_argv) else "..."
-        return f'python -c "{printable(" ".join(code.split()), MOST)}"'
+        before = re.split("['\"]", code, maxsplit=1)[
+            0
+        ]  # lists, logs and recordings show no literal: it may be a secret
+        shown = " ".join(before.split()) + ("…" if before != code else "")
+        return f'python -c "{printable(shown, MOST)}"'
     if first in ("", "-"):
         return f"python {first}".rstrip()
     spec = getattr(sys.modules.get("__main__"), "__spec__", None)

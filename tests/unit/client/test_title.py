@@ -21,10 +21,17 @@ def told(*words: str, folder: Path | None = None, given: str = "") -> str:
 def test_code_on_the_command_line_is_shown_bounded_and_escaped() -> None:
     assert told("-c", ASK) == 'python -c "from sioms.client.title import title; print(tit…"'
     assert (
-        told("-P", "-c", f"x = '\x1b[2J'\n{ASK}", "-c", "more")
-        == r"""python -c "x = '\x1b[2J' from sioms.client.title import ti…" """.strip()
+        told("-P", "-c", f"# \x1b[2J\n{ASK}", "-c", "more")
+        == r"""python -c "# \x1b[2J from sioms.client.title import title;…" """.strip()
     )
     assert told(f"-c{ASK}", "-c").startswith('python -c "from sioms')
+
+
+@pytest.mark.parametrize("quote", ["'", '"'])
+def test_no_literal_of_the_code_is_shown(quote: str) -> None:
+    """Names stand in logs, in recordings and in lists of other machines; a literal may be a password."""
+    code = f"import sys; word = {quote}secret{quote}; {ASK}"
+    assert told("-c", code) == 'python -c "import sys; word =…"'
 
 
 @pytest.mark.parametrize("argv", ["[]", "['-c']", "['-c'] * 30"])
