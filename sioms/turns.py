@@ -124,10 +124,17 @@ class Turns:
 
     @property
     def pause_s(self) -> float | None:
-        """How long the loop may wait before ``serve`` has to be called again [s]; None for ever."""
+        """How long the loop may wait before ``serve`` has to be called again [s]; None for ever: no source pauses, or
+        none has to any more.
+        """
         if not self._paused:
             return None
-        return max(0.0, (self._window_ns + WINDOW_NS - time.monotonic_ns()) * 1e-9)
+        now_ns = time.monotonic_ns()
+        left_ns = self._window_ns + WINDOW_NS - now_ns
+        if left_ns > 0:
+            return left_ns * 1e-9
+        self._open_window(now_ns)
+        return None
 
     def serve(self) -> None:
         """Take one packet of the source whose turn it is; call after every wait of the loop."""

@@ -80,6 +80,15 @@ def test_readers_get_their_share_and_owners_come_first(server):
     assert "owner" in [source for source, _ in server.served[before:]]
 
 
+def test_whose_pause_is_over_is_looked_at_again_as_soon_as_that_is_asked_for(server):
+    server.connect("one", 0, 9)
+    server.cost_ns = turns.WINDOW_NS * 6 // 10
+    server.step()
+    assert 0.0 < server.turns.pause_s <= 0.4e-3 and not server.epoll.poll(0)
+    server.now_ns += turns.WINDOW_NS
+    assert server.turns.pause_s is None and server.epoll.poll(0)
+
+
 def test_a_connection_that_ends_takes_its_source_along(server):
     ours = server.connect("one", 1, 1)
     assert server.turns.remove(ours.fileno()) and not server.turns.remove(ours.fileno())
