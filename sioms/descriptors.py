@@ -10,6 +10,7 @@ import socket
 import time
 from array import array
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import Protocol, TypeVar
 
 
@@ -58,6 +59,29 @@ def has_ended(sock: socket.socket) -> bool:
         return True
 
 
+def process_of(pidfd: int) -> int:
+    """Return the number of the process that a descriptor is for; 0: it is not known here, or has ended."""
+    with suppress(OSError, ValueError), open(f"/proc/self/fdinfo/{pidfd}") as file:
+        return max(0, next((int(line.split()[1]) for line in file if line.startswith("Pid:")), 0))
+    return 0
+
+
+def is_exiting(pid: int) -> bool:
+    """Tell whether a process has begun to end, with all its threads: it does nothing any more, and is about to close
+    what it has open, one after another. False where that is not to be seen.
+    """
+    try:
+        for thread in os.listdir(f"/proc/{pid}/task"):
+            with open(f"/proc/{pid}/task/{thread}/stat") as file:
+                if not int(file.read().rpartition(")")[2].split()[_FLAGS]) & _EXITING:
+                    return False
+    except (OSError, ValueError, IndexError):
+        return False
+    return True
+
+
+_FLAGS, _EXITING = 6, 0x4
+"""Which word behind the name is the flags of a thread, proc_pid_stat(5), and PF_EXITING of <linux/sched.h>."""
 MOST_FILES = 65536
 """What a process that serves many permits itself, where its hard limit does: a session or handle takes the daemon some
 three, a device some thirty.

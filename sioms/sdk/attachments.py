@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sioms.descriptors import has_ended
+from sioms.descriptors import has_ended, process_of
 from sioms.protocol import verbs
 from sioms.protocol.compiled import add_decoders
 from sioms.protocol.driver_verbs import Attach, Detached
@@ -24,7 +24,7 @@ from sioms.protocol.journal import JournalWriter, Note
 from sioms.protocol.messages import MAX_INLINE, MAX_PACKET, MAX_WRITE, MalformedMessage
 from sioms.protocol.text import shown
 from sioms.protocol.verbs import Message
-from sioms.timestamps import Timestamps, receive
+from sioms.timestamps import Timestamps, pending_bytes, receive
 from sioms.turns import Turns
 
 from .blocks import AnyBlock, AxisBlock
@@ -107,11 +107,22 @@ class Attachments:
         and have not been halted; else None.
         """
         handle = self._owners.get(fd)
-        if handle is None or handle.halted or len(handle.axes) != handle.block.n:
-            return None
-        if [block for block in self._service.blocks if isinstance(block, AxisBlock)] != [handle.block]:
+        if handle is None or not self._owns_all(handle):
             return None
         return handle if fd == handle.pidfd or has_ended(handle.sock) else None
+
+    def of_process(self, pid: int) -> list[Handle]:
+        """Return the owners of all axes of the device that are of a process, and have sent nothing that is left to be
+        taken.
+        """
+        owners = {handle.number: handle for handle in self._owners.values() if handle.pid == pid}.values()
+        return [handle for handle in owners if self._owns_all(handle) and not pending_bytes(handle.sock)]
+
+    def _owns_all(self, handle: Handle) -> bool:
+        """Tell whether all axes of the device are his and have not been halted."""
+        if handle.halted or len(handle.axes) != handle.block.n:
+            return False
+        return [block for block in self._service.blocks if isinstance(block, AxisBlock)] == [handle.block]
 
     def detach(self, number: int, errno_: int = 0, reason: str = "") -> None:
         """End a handle because the daemon says so, and tell its client why; one that has ended already is confirmed
@@ -145,6 +156,7 @@ class Attachments:
         if self._service.stops.resets.count:  # its client may have used it for long already
             handle.note_reset(self._service.stops.resets.latest_ns(id(handle.block), dict.fromkeys(channels, -1), 0))
         if exclusive:
+            handle.pid = process_of(handle.pidfd)
             self._owners |= dict.fromkeys((sock.fileno(), *([handle.pidfd] if handle.pidfd >= 0 else [])), handle)
         if lease_ns:
             self._leased.append(handle)

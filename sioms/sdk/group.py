@@ -154,8 +154,18 @@ class Group:
         """Have a member halt by steps whose owner, or the daemon, has gone; return False where its loop has to."""
         if not member.losses:
             member.losses = member.runtime.losses(quiet.ready)
-            self._loses |= bool(member.losses)
+            if member.losses and not self._lose_process(member.runtime.exiting(quiet.ready)):
+                self._loses = True
         return not member.losses or not begin_halt(quiet.record, time.monotonic_ns())
+
+    def _lose_process(self, pid: int) -> bool:
+        """Have all halt whose owner is a process that is about to end; return whether it is known which."""
+        for fd, member in self._members.items() if pid else ():
+            if not member.losses and (losses := member.runtime.losses_of(pid)):
+                member.losses = losses
+                halts = member.quiet is not None and not begin_halt(member.quiet.record, time.monotonic_ns())
+                self._rank(fd, CAN_WAIT if halts else STOPS)
+        return pid != 0
 
     def _rank(self, fd: int, rank: int) -> None:
         """Let a member wait with others of its rank, behind those that have come before, if not with better ones."""

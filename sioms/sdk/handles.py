@@ -92,7 +92,7 @@ class Handle(Struct, eq=False):
         who: whose it is, for messages; uid: his number.
         sock: socket to the client, non-blocking.
         wakes: writing end of the pipe that wakes the client, non-blocking.
-        pidfd: the client's process, -1 when unknown.
+        pidfd: the client's process, -1 when unknown; pid: its number, if it owns something and that is known.
         block: what it shows; ``channels`` of it, and one bit of them if ``bit`` >= 0.
         access: what it may do by its mode; ``exclusive`` says that it owns its channels.
         rights: what its user may do.
@@ -145,6 +145,7 @@ class Handle(Struct, eq=False):
     queued_bytes: int = 0
     reset_ns: int = 0
     cut_short: dict[int, tuple[int, str]] = field(default_factory=dict)
+    pid: int = 0
     writes: bool = False
     axes: list[int] = field(default_factory=list)
 

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from sioms.descriptors import is_exiting
 from sioms.protocol import driver_verbs
 from sioms.protocol.flags import PageState
 from sioms.protocol.journal import HEADER, JOURNAL_SIZE, JournalWriter, Note
@@ -314,6 +315,17 @@ class Runtime(Ticking):
             elif (handle := self.clients.gone(fd)) is not None:
                 found.append(partial(self.clients.drop, handle))
         return found
+
+    def exiting(self, ready: Iterable[int]) -> int:
+        """Return the process of an owner whose end descriptors tell, as ``losses``, if all of it is about to end; 0: it
+        is not, or that is not to be seen.
+        """
+        owners = (self.clients.gone(fd) for fd in ready)
+        return next((owner.pid for owner in owners if owner is not None and is_exiting(owner.pid)), 0)
+
+    def losses_of(self, pid: int) -> list[Callable[[], None]]:
+        """Return what is to be done first about a process that is about to end, as ``losses``."""
+        return [partial(self.clients.drop, handle) for handle in self.clients.of_process(pid)]
 
     @property
     def pause_s(self) -> float | None:

@@ -17,7 +17,7 @@ class Runtime:
         self.poll_fd, self._fails_in = os.eventfd(1, os.EFD_NONBLOCK), fails_in
         self.running, self.pause_s, self.did = True, None, []
         self.record, self.timers = SimpleNamespace(address=0, left=0, is_stopped=0, stopped=0, called=0), ()
-        self.ready, self.lost = [], []
+        self.ready, self.lost, self.lost_with, self.process = [], [], [], 0
         self.stopped_ns = 0
 
     def _do(self, what):
@@ -34,6 +34,13 @@ class Runtime:
 
     def losses(self, ready):
         return self.lost
+
+    def exiting(self, ready):
+        return self.process
+
+    def losses_of(self, pid):
+        assert pid == 7
+        return self.lost_with
 
     def take_back(self, quiet):
         self._do("take back")
@@ -191,6 +198,23 @@ def test_a_stop_is_begun_by_all_and_shown_before_one_is_served(group, monkeypatc
     for member in members:
         member.runtime.stopped_ns = 0
     assert not group._look_for_stops(), "a reset"
+
+
+def test_all_whose_owner_is_about_to_end_halt_when_the_first_hears_of_it(group):
+    first, halts, refuses, of_another = members = start(group, "", "", "", "")
+    first.runtime.lost, first.runtime.process = [lambda: None], 7
+    refuses.runtime.record.stopped = 1
+    for member in (halts, refuses):
+        member.runtime.lost_with = [lambda runtime=member.runtime: runtime.did.append("owner ended")]
+    put(group, [first])
+    assert not group._loses, "nobody is waited for"
+    assert waiting(group, STOPS) == [refuses.runtime.poll_fd]
+    assert waiting(group, CAN_WAIT) == [member.runtime.poll_fd for member in (halts, first)]
+    for _ in members:
+        group._serve_next()
+    for member in (halts, refuses):
+        assert member.runtime.did == ["start", "lend", "take back", "owner ended", "serve", "lend"]
+    assert of_another.runtime.did == ["start", "lend"]
 
 
 def test_whose_owner_has_gone_halts_by_steps_or_goes_first_and_is_ended_before_anything_else(group):
