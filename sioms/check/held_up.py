@@ -22,7 +22,7 @@ class Waits:
     """
 
     def __init__(self, processes: Mapping[str, int]) -> None:
-        self._before = {pid: _waited_ns(pid) for pid in processes.values()}
+        self._before = {pid: waited_ns(pid) for pid in processes.values()}
 
     def longest(self, processes: Mapping[str, int]) -> str:
         """Return which process was held up the longest, and how long, in words; '' when none was.
@@ -30,14 +30,24 @@ class Waits:
         Args:
             processes: those of now; one that is new has waited since it began.
         """
-        waits = {what: (_waited_ns(pid) - self._before.get(pid, 0)) / 1e9 for what, pid in processes.items()}
+        waits = {what: (waited_ns(pid) - self._before.get(pid, 0)) / 1e9 for what, pid in processes.items()}
         what = max(waits, key=waits.__getitem__, default="")
         if not what or waits[what] < HELD_UP_S:
             return ""
         return f"{what} waited {waits[what]:.1f} s for a processor"
 
 
-def _waited_ns(pid: int) -> int:
+def tree_waited_ns(pid: int) -> int:
+    """Return the longest time that a process or one of its descendants has been ready to run without running [ns]."""
+    try:
+        with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
+            children = [int(word) for word in file.read().split()]
+    except (OSError, ValueError):  # it has ended, or the kernel does not tell
+        children = []
+    return max([waited_ns(pid), *map(tree_waited_ns, children)])
+
+
+def waited_ns(pid: int) -> int:
     """Return how long a process has been ready to run without running [ns]; 0 where that is not known."""
     try:
         with open(f"/proc/{pid}/schedstat", encoding="ascii") as file:

@@ -134,7 +134,7 @@ class Busy:
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, *waited_s: float) -> None:
         looks = iter(waited_s)
-        monkeypatch.setattr(held_up, "_waited_ns", lambda pid: int(1e9 * next(looks)))
+        monkeypatch.setattr(held_up, "waited_ns", lambda pid: int(1e9 * next(looks)))
         self.settled = 0
 
     def processes(self) -> dict[str, int]:
