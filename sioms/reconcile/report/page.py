@@ -10,6 +10,7 @@ from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.report.pictures import pictures
 from sioms.reconcile.report.words import (
     CHANCE,
+    TOGETHER,
     columns,
     groups,
     headline,
@@ -21,6 +22,7 @@ from sioms.reconcile.report.words import (
     shrunk,
     span,
     sureness,
+    told,
 )
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.session import knobs
@@ -181,9 +183,13 @@ def _instead(v: Verdict) -> Iterator[str]:
 
 def _numbers(p: Page, effects: Sequence[NamedEffect]) -> None:
     rows: list[Sequence[object]] = []
-    every = []
+    every: list[Estimate] = []
     for e in effects:
         label, equation = e.title, e.equation
+        if not told(e):
+            rows.append((label, equation, f"{len(e.parameters)} numbers", Cell("-"), Cell("-"), "", TOGETHER))
+            every += e.parameters
+            continue
         for mine in groups(e).values():
             rows.append((label, equation, *_quantity(mine)))
             label = equation = ""

@@ -7,6 +7,7 @@ import math
 from typing import Any
 
 from sioms.reconcile.axis_verdict import AxisVerdict
+from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.sensors.verdict import SensorVerdict
 from sioms.reconcile.session import knobs
 from sioms.reconcile.thresholds import NOISE
@@ -19,6 +20,8 @@ HEAD = {
     Outcome.AMBIGUOUS: "Something is missing, but these records cannot distinguish between the candidates.",
 }
 LINES = 10
+#: Said of a formula's numbers that make up for each other.
+TOGETHER = "its numbers are told together only, not one by one (model.toml has them)"
 #: Permutations do as well no oftener than this: a variable orders a disagreement.
 CHANCE = 0.05
 
@@ -139,8 +142,21 @@ def places(v: Verdict, most: int) -> str:
     return f"the disagreement depends on {parts}; permutation p <= {max(p.p for p in shown):.2f}" if shown else ""
 
 
+def told(e: NamedEffect) -> bool:
+    """Say whether the numbers of an effect are told one by one: of a formula without a name most of them to better than
+    their own size; else they make up for each other, or for what has a name, and only their sum is told.
+    """
+    free = [p for p in e.parameters if p.high > p.low]
+    sure = sum(p.high - p.low < 2.0 * abs(p.value) for p in free)
+    return not e.name.startswith(TERM_PREFIX) or 2 * sure >= len(free)
+
+
 def in_words(e: NamedEffect) -> str:
-    """Name an effect with its values; of a number for every element, the spread."""
+    """Name an effect with its values; of a number for every element, the spread; of a formula whose numbers are not
+    told one by one, none.
+    """
+    if not told(e):
+        return f"{e.title}: {e.equation}; {TOGETHER}"
     parts = []
     for p in e.parameters:
         if "[" not in p.symbol:

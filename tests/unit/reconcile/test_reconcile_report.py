@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import json
 import re
 from dataclasses import replace
 from functools import cache
@@ -16,7 +17,7 @@ from sioms.reconcile.experiment import Experiment
 from sioms.reconcile.files.axis import read_model
 from sioms.reconcile.ladder import Step
 from sioms.reconcile.report.page import page
-from sioms.reconcile.report.words import sureness
+from sioms.reconcile.report.words import as_json, summary, sureness
 from sioms.reconcile.rules import told_apart
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Place
 
@@ -104,3 +105,18 @@ def test_what_contains_an_effect_and_explains_as_much_is_said_to_add_nothing() -
     assert ruled["offset"] == "removed 40 % of the residual where this effect removed 97.1 %"
     far = Step("add", "coulomb", 1.0, 0.5, None, {"stribeck": 0.9})
     assert "removed 90 %" in told_apart("coulomb", ["stribeck"], [], [far], {"coulomb"}, {"stribeck"})[0]["stribeck"]
+
+
+@pytest.mark.parametrize(("half", "told"), [(0.3, True), (2.0, False)])
+def test_numbers_of_a_formula_that_make_up_for_each_other_are_not_told_one_by_one(
+    half: float, told: bool, tmp_path: Path
+) -> None:
+    """Two motors on a carriage: the values of a law of speed were printed with intervals of twice their size."""
+    law = effect("term_law_of_speed")
+    values = tuple(Estimate(f"s{i}", 3.0, 3.0 * (1.0 - half), 3.0 * (1.0 + half), "N", "") for i in range(8))
+    found = replace(verdict(), outcome=Outcome.UNEXPLAINED, symbolic=(replace(law, parameters=values),))
+    page = text_of(found, tmp_path)
+    said = "\n".join(summary(found, "report.html"))
+    assert ("s0 = 3" in said) == told
+    assert ("told together only" in said) == (not told) == ("told together only" in page)
+    assert json.loads(as_json(found, 1.0))["symbolic"][0]["parameters"]["s7"]["value"] == 3.0
