@@ -194,7 +194,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     searched_for = [e for e in found_here if e.name not in s.searcher.frozen]
     # beside a gap the remainder is of bounces, which no other effect can be
     doubtful = [] if rattles(found.fit.model) else [e.name for e in searched_for if doubted(e, ratio)]
-    hanging = [e.name for e in searched_for if e.name not in doubtful and _hangs(e.name, tight, spans)]
+    hanging = [e.name for e in searched_for if e.name not in doubtful and hangs(e.name, tight, spans)]
     for doubts, of in ((doubtful, of_doubts), (hanging, of_hanging)):
         if doubts and said in (Outcome.NAMED, Outcome.AMBIGUOUS):
             said = Outcome.AMBIGUOUS
@@ -259,7 +259,7 @@ def _widened(spans: Spans, room: Mapping[tuple[str, str], float]) -> Spans:
     return {key: _wide(span, room.get(key, 0.0)) for key, span in spans.items()}
 
 
-def _hangs(name: str, tight: Spans, wide: Spans) -> bool:
+def hangs(name: str, tight: Spans, wide: Spans) -> bool:
     """Say whether an effect may be none for no other reason than what exponents leave open."""
     effect = known()[name]
     key, nothing = (name, effect.primary.symbol), effect.neutral

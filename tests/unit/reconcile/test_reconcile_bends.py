@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from sioms.reconcile.axis import analyse
-from sioms.reconcile.bends import bent, built_along, loosened
+from sioms.reconcile.bends import DROP, Bend, bent, built_along, loosened
+from sioms.reconcile.conclude import hangs
 from sioms.reconcile.dry import built_up
 from sioms.reconcile.effects import library
 from sioms.reconcile.evidence import spans_of
@@ -17,7 +18,8 @@ from sioms.reconcile.fit import Fit, Problem, refit
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.prepare import Options, prepare
 from sioms.reconcile.records import Record, Session
-from sioms.reconcile.verdict import Outcome
+from sioms.reconcile.refusals import another_law
+from sioms.reconcile.verdict import NamedEffect, Outcome
 
 DT, STEP = 0.002, 1e-6
 RIG = AxisModel(False, DT, 0.0, 0.0, STEP, 0.1, 10.0, 0.3, imposed=True)
@@ -105,8 +107,8 @@ def test_a_right_name_has_the_exponent_of_its_law(law: Law, names: tuple[str, ..
 
 def test_what_shares_a_force_of_the_speed_hangs_on_its_laws() -> None:
     """Friction that drops with exp(-v/v0) beside viscous friction: told as the library has it, 4.4 N of 3 are dry."""
-    hangs = bends_of(lambda x, v: drop(v, 0.1, 1.0) + 10.0 * v, "stribeck", "viscous")
-    assert {*hangs, *(name for names in hangs.values() for name in names)} == {"stribeck", "viscous"}
+    found = bends_of(lambda x, v: drop(v, 0.1, 1.0) + 10.0 * v, "stribeck", "viscous")
+    assert {*found, *(name for names in found.values() for name in names)} == {"stribeck", "viscous"}
 
 
 def test_intervals_have_room_for_exponents_that_are_not_told() -> None:
@@ -137,3 +139,17 @@ def test_a_drop_of_another_form_has_no_name_though_nothing_remains(power: float,
     assert {e.name for e in verdict.effects} == ({"stribeck", "viscous"} if power == 2.0 else set())
     assert any("another one" in c.why for c in verdict.candidates) == (power == 1.0)
     assert any("than that of the law" in note for note in verdict.notes) == (power == 1.0)
+
+
+def test_what_hangs_on_a_law_that_is_another_one_is_refused_with_it() -> None:
+    found = [NamedEffect(n, n, "", "", (), 0.5, 9.0, None, ()) for n in ("stribeck", "viscous", "payload")]
+    refused = {c.name: c.why for c in another_law(found, [], [Bend("stribeck", DROP, -1.2, 0.2, 0.1, ("viscous",))])}
+    assert refused.keys() == {"stribeck", "viscous"}
+    assert "exponent of the drop" in refused["stribeck"] and "hangs" in refused["viscous"]
+
+
+def test_an_effect_is_doubted_where_exponents_alone_let_it_be_none() -> None:
+    key, noise = ("quadratic_drag", "c"), {("quadratic_drag", "c"): (2.0, 4.0)}
+    assert hangs("quadratic_drag", noise, {key: (-1.0, 7.0)})
+    assert not hangs("quadratic_drag", noise, {key: (1.0, 5.0)})
+    assert not hangs("quadratic_drag", {key: (-1.0, 3.0)}, {key: (-2.0, 4.0)}), "noise alone does, which is told"
