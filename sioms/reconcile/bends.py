@@ -45,7 +45,10 @@ RIPPLES = {"cogging": "amp", "torque_ripple": "depth", "coulomb_position": "Fm",
 #: Laws of one variable.
 TOGETHER = ((*OF_SPEED, *DRY), OF_PLACE, (*OF_FORCE, "load_friction", "load_square_friction"))
 #: Words for what is bent.
-POWER, WAVE, DROP, BUILDING = "power", "shape of the wave", "exponent of the drop", "exponent of what builds up"
+POWER, DROP, BUILDING = "power", "exponent of the drop", "exponent of what builds up"
+#: A wave has edges or points (its third harmonic is a quarter of the exponent), or flanks (its fifth is as much): a
+#: triangle that is cut off at two thirds has no third.
+WAVE, FLANKS = "shape of the wave", "flank of the wave"
 #: A variable below this share of its usual size is taken for as large; a small change of an exponent.
 LEAST, STEP = 1e-3, 0.05
 
@@ -115,7 +118,7 @@ def loosened(problem: Problem, fit: Fit, names: Sequence[str]) -> dict[tuple[str
 
 def _beside_size(fit: Fit, bend: Bend, column: Array) -> Array:
     """Take off a bend what only changes the size of its effect, where its law has no scale of its own."""
-    if bend.what not in (POWER, WAVE):
+    if bend.what not in (POWER, WAVE, FLANKS):
         return column
     size = RIPPLES.get(bend.effect, known()[bend.effect].primary.symbol)
     own = fit.jacobian[:, [(f.effect, f.symbol) == (bend.effect, size) for f in fit.free]]
@@ -181,7 +184,8 @@ def _forces(model: AxisModel, name: str, runs: Sequence[Run]) -> Iterator[tuple[
         usual = max(float(np.sqrt(np.mean(np.concatenate(over) ** 2))), 1e-300)
         yield POWER, lambda run: _acting(model, effect, run) * _log(getattr(run, POWERS[name]) / usual)
     if name in RIPPLES:
-        yield WAVE, lambda run: _edges(model, name, run)
+        yield WAVE, lambda run: _rippling(model, name, run, lambda angle: np.sin(angle) * _log(np.sin(angle)))
+        yield FLANKS, lambda run: _rippling(model, name, run, lambda angle: 0.25 * np.sin(5.0 * angle))
     if "vs" in given:
         yield DROP, lambda run: _dropping(given, run)
     if effect.mechanism.builds_up:
@@ -197,10 +201,10 @@ def _acting(model: AxisModel, effect: Effect, run: Run) -> Array:
     return effect.force(run.x, run.v, run.applied, run.temperature, np.sign(run.v), row)
 
 
-def _edges(model: AxisModel, name: str, run: Run) -> Array:
+def _rippling(model: AxisModel, name: str, run: Run, shape: Callable[[Array], Array]) -> Array:
+    """Return the force of a wave that has that shape of its angle, and the size of the named one."""
     given = model.effects[name]
-    s = np.sin(given["n"] * 2.0 * np.pi / model.pitch * run.x + given["phase"])
-    wave: Array = given[RIPPLES[name]] * s * _log(s)
+    wave = given[RIPPLES[name]] * shape(given["n"] * 2.0 * np.pi / model.pitch * run.x + given["phase"])
     match name:
         case "torque_ripple":
             return wave * run.applied

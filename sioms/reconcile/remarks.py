@@ -22,9 +22,8 @@ def of_change(title: str, change: Uneven, ratio: float) -> str:
 
 
 def of_bend(title: str, b: Bend) -> str:
-    way = "higher" if b.change > 0.0 else "lower"
     return (
-        f"{title}: where all numbers may follow, its {b.what} comes out {way} than that of the law "
+        f"{title}: where all numbers may follow, its {b.what} comes to another value than that of the law "
         f"({b.errors:.1f} standard errors); its law is another one"
     )
 

@@ -74,6 +74,11 @@ def triangle(x: Array) -> Array:
     return np.asarray(2.0 / np.pi * np.arcsin(np.sin(2.0 * 2.0 * np.pi / 0.1 * x + 0.1)))
 
 
+def cut_off(x: Array) -> Array:
+    """Of all such waves the nearest to a sine: its third harmonic is none, its fifth a twenty-fifth."""
+    return np.clip(1.5 * triangle(x), -1.0, 1.0)
+
+
 @pytest.mark.parametrize(
     ("law", "names"),
     [
@@ -82,9 +87,18 @@ def triangle(x: Array) -> Array:
         (lambda x, v: drop(v, 0.03, 1.0) + 10.0 * v, ("stribeck", "viscous")),
         (lambda x, v: 3.0 * np.sign(v) + 4.0 * np.tanh(v / 0.2), ("coulomb", "viscous")),
         (lambda x, v: (3.0 + triangle(x)) * np.sign(v) + 10.0 * v, ("coulomb_position", "viscous")),
+        (lambda x, v: (3.0 + cut_off(x)) * np.sign(v) + 10.0 * v, ("coulomb_position", "viscous")),
         (lambda x, v: 0.5 * np.sinh(x / 0.03) + 3.0 * np.sign(v), ("spring", "coulomb")),
     ],
-    ids=["slow drop", "slow drop and two drags", "drop", "drag that levels off", "triangle", "spring that hardens"],
+    ids=[
+        "slow drop",
+        "slow drop and two drags",
+        "drop",
+        "drag that levels off",
+        "triangle",
+        "triangle cut off",
+        "spring that hardens",
+    ],
 )  # fmt: skip
 def test_a_law_near_the_named_one_is_told_by_its_exponent(law: Law, names: tuple[str, ...]) -> None:
     assert bends_of(law, *names)
