@@ -207,9 +207,10 @@ class _Show:
             "light beam",
         )
         with self._cell.open("mod0.xaxis", "rw", PATIENCE_S) as axis, self._cell.open("beam0") as beam:
+            before = beam.read()
             axis.move(0.0, max_velocity=0.25, max_acceleration=3.0)
             with waiting("beam 0 to be broken by mod0.xaxis"):
-                broken = beam.wait_event(timeout=PATIENCE_S)
+                broken = beam.wait_event(last=before, timeout=PATIENCE_S)
             awake_us = (time.monotonic_ns() - broken.stamp_ns) / 1e3
             self._note("beam 0 broken", broken.stamp_ns)
             with waiting("beam 0 to be free again"):
