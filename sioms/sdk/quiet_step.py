@@ -580,9 +580,13 @@ class Many(Record):
 def heed_one(q: Quiet, a: int, b: int, c: int) -> int:
     """Do what is ready of one device; return whether its loop has to go on, of which it does not know yet."""
     count = wait_for(q.poll, q.ready, 0)
-    if not count or not heed(q, count):
+    if not count:
+        q.known = 0
         return 0
-    return not q.patient or q.left or q.slackens or q.waiting > q.known
+    found = heed(q, count)
+    news = not q.patient or q.left or q.slackens or q.waiting > q.known
+    q.known = min(q.known, q.waiting)
+    return found and news
 
 
 @step

@@ -462,6 +462,23 @@ def test_who_waits_for_its_turn_is_the_loops_again_when_something_else_is_ready(
         assert waits() == [1, 1], "its tick is the loop's"
 
 
+def test_what_steps_have_served_meanwhile_hides_nothing_that_comes_after_it(make):
+    """A write that had to wait for two others, and then its owner's end."""
+    device = make(expired=0)
+    os.eventfd_write(device.other, 1)
+    assert heed_one(device.quiet, 0, 0, 0) and not wait_turn(device.quiet) and device.quiet.known == 1
+    os.eventfd_read(device.other)
+    os.eventfd_write(device.timer, 1)
+    assert not heed_one(device.quiet, 0, 0, 0), "nothing but a tick is left"
+    os.eventfd_write(device.control, 1)
+    assert heed_one(device.quiet, 0, 0, 0)
+    wait_turn(device.quiet)
+    os.eventfd_read(device.control)
+    assert not heed_one(device.quiet, 0, 0, 0), "nothing at all"
+    os.eventfd_write(device.control, 1)
+    assert heed_one(device.quiet, 0, 0, 0)
+
+
 def plain_write(served):
     """Return a packet that steps serve: a position of an axis at rest, in its limits."""
     record = dict.fromkeys(WRITE[NodeClass.AXIS], 0) | {"control_mode": int(ControlMode.POSITION), "position": 0.1}
