@@ -184,6 +184,10 @@ class Device:
 
     def close(self) -> None:
         self.runtime.release()
+        self.let_go()
+
+    def let_go(self) -> None:
+        """Close what is left when its runtime has been released."""
         for fd in self._kept:
             os.close(fd)
         self.control.close()

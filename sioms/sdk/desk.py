@@ -111,6 +111,11 @@ class WriteDesk:
                 record.axes[first] = axis
                 first += 1
 
+    def close(self) -> None:
+        """Make room for other devices: this one has ended, and may have failed before anything was worked in."""
+        self._busy[0] -= self.record.kept > 0
+        self.record.kept = 0
+
     def take_back(self, tick: int) -> None:
         """Work in what has been served: writes, whose answers have told ``tick``, and words of gateways."""
         record = self.record

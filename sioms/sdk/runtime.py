@@ -349,6 +349,8 @@ class Runtime(Ticking):
     def release(self) -> None:
         """Close what is open, when the process goes on with other devices; the daemon hears of it last."""
         self.clients.end_all(errno.EIO, "its driver has ended")
+        if self._quiet is not None:
+            self._quiet.desk.close()
         for held in self.held.values():
             held.detach()
         for kept in self._kept:

@@ -153,9 +153,7 @@ def test_nothing_is_left_of_a_device_that_has_ended() -> None:
         ended, fd = weakref.ref(device.runtime), device.runtime.poll_fd
         device.runtime.running = False
         group._go_on(fd, group._members[fd])
-        device.control.close()
-        for kept in device._kept:
-            os.close(kept)
+        device.let_go()
         del device
         was = len(os.listdir("/proc/self/fd"))
         gc.disable()

@@ -81,7 +81,11 @@ class World:
 
     def write(self) -> None:
         """Have a client write: what steps serve, mostly, and sometimes what they leave."""
-        client, chance = self.chance.choice(self.clients), self.chance
+        self.write_to(self.chance.choice(self.clients))
+
+    def write_to(self, client: Client) -> None:
+        """Have this one write."""
+        chance = self.chance
         client.number += 1
         velocity, mode = chance.choice([-0.02, 0.02]), ControlMode.VELOCITY
         columns = {"velocity": velocity, "control_mode": int(mode)}
@@ -164,6 +168,7 @@ class World:
     def check(self) -> None:
         """See that all was answered and is as it was asked for."""
         self.calm()
+        assert self.process.group._busy[0] == 0, "of nobody are writes kept"
         for client in self.clients:
             bank = client.device.driver.bank
             assert not client.sent, "each write has an answer"
@@ -220,3 +225,32 @@ def test_what_is_acknowledged_holds_and_nothing_is_taken_under_a_stop(hz: tuple[
             for client in world.clients:
                 client.sock.close()
     assert 0.3 * taken < served < taken, "most are served by steps, and some are not"
+
+
+def test_a_device_that_fails_before_its_writes_are_worked_in_leaves_room_for_others(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Steps keep writes for two devices of a process."""
+
+    def out_of_memory() -> None:
+        raise MemoryError
+
+    with processes() as make:
+        SENT.install(monkeypatch)
+        world = World(make([100.0] * 3, [0.0] * 3, SimAxes, _table), random.Random(1))
+        world.calm()
+        for client in world.clients[:2]:
+            device = client.device
+            world.write_to(client)
+            world.process.look()
+            assert device.runtime._quiet.desk.record.kept == 1
+            monkeypatch.setattr(device.runtime.pages, "take_back", out_of_memory)
+            CLOCK.go_to(CLOCK.due_ns())
+            world.process.look()
+            world.process.serve_all()
+            assert not device.runtime.running
+            world.process.devices.remove(device)
+            device.let_go()
+        assert world.process.group._busy[0] == 0
+        for client in world.clients:
+            client.sock.close()
