@@ -40,6 +40,7 @@ MODULES: tuple[str, ...] = (
     "sioms.plant.motor_step",
     "sioms.plant.stepper_step",
     "sioms.plant.binary_step",
+    "sioms.plant.planar_step",
     "sioms.sdk.serve_step",
     "sioms.sdk.quiet_step",
     "sioms.drivers.sim.axes_step",

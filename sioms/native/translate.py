@@ -32,7 +32,8 @@ HEAD = """/* Made by sioms.native.translate; do not edit. */
 #include <time.h>
 #include <unistd.h>
 """
-MATHS = {"sqrt": float, "sin": float, "cos": float, "copysign": float, "exp": float, "expm1": float, "log1p": float}
+MATHS = {"sqrt": float, "sin": float, "cos": float, "copysign": float, "exp": float, "expm1": float, "log1p": float,
+         "atan2": float, "remainder": float}  # fmt: skip
 EXTERNAL = (numbers, system)
 ELEMENTS = {Floats: float, Integers: int, Flags: int, Bytes: int}
 NUMBERS = {int: "int64_t", float: "double", bool: "int64_t", type(None): "void"}

@@ -13,7 +13,7 @@ stops the object within a step and never drives it.
 
 Integration: positions by half steps before and after each change of velocity, of second order where nothing slides.
 
-Plain floats in lists, one function of the state for each thing: it runs some ten thousand times a second.
+The steps are in ``planar_step``, compiled where they can be: they run some ten thousand times a second.
 """
 
 from __future__ import annotations
@@ -21,16 +21,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sioms.plant.outline import Outline
-from sioms.plant.skin import Skin, friction, skin
+from sioms.plant.planar_step import AREA, FINGERS, FOUND, LENGTH, Plane, advance_plane, overlap_of, touch_object
+from sioms.plant.skin import FRICTION, Skin, skin
 
 GRAVITY = 9.80665
-LOST = math.inf
-
 
 FARTHEST_M, NARROWEST_M = 0.72, 1e-3
 """Of an object: how far it may reach from its centroid, and how wide it must be at least [m]."""
@@ -107,11 +107,6 @@ class Mount:
                 f"describe finger's mount: friction_by_load is {self.friction_by_load}; want forces of 0 or more that "
                 f"rise, each with a factor of 0 or more, at most {most:g}"
             )
-
-    def coefficient(self, radius_m: float, normal: float) -> float:
-        """Return the coefficient of friction of a contact with this relative radius [m], under a normal force [N]."""
-        plain = friction(radius_m) if self.friction is None else self.friction
-        return plain * _between(self.friction_by_load, normal) if self.friction_by_load else plain
 
 
 @dataclass(slots=True)
@@ -226,13 +221,21 @@ class World:
         ]
         self.pose, self.speed = list(pose), [0.0, 0.0, 0.0]
         self.lifted, self.time_s = False, 0.0
-        outline = body.outline
-        self._points: list[tuple[float, float]] = [(float(x), float(y)) for x, y in outline.points]
-        self._inertia = body.mass * outline.gyration_m**2
-        self._most_force = body.platen_friction * body.mass * GRAVITY
-        self._most_moment = self._most_force * _mean_distance(outline)
-        for finger in self.fingers:
-            self._touch(finger, 0.0)
+        self._make_plane()
+        self._look()
+
+    def _make_plane(self) -> None:
+        self._state = np.zeros(FINGERS + LENGTH * len(self.fingers))
+        self._plane = _plane(self.body, [finger.mount for finger in self.fingers], self.skin, self._state)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return all but what steps work on, which is made anew: copies are worlds of their own."""
+        return {name: value for name, value in vars(self).items() if name not in ("_plane", "_state")}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Take what `__getstate__` returned."""
+        vars(self).update(state)
+        self._make_plane()
 
     def command(self, places: Sequence[Sequence[float]], time_s: float) -> None:
         """Let the joints' commands go evenly from where they are to `places` within `time_s` [s]."""
@@ -262,7 +265,7 @@ class World:
             pose: of the object; where it is now by default.
         """
         ox, oy, turn = self.pose if pose is None else pose
-        corners = np.array(self._points)
+        corners = self.body.outline.points
         sides = np.roll(corners, -1, axis=0) - corners
         c, s = math.cos(turn), math.sin(turn)
         found = []
@@ -278,232 +281,92 @@ class World:
     def lift(self) -> None:
         """Take the object off the platen: fingers meet nothing."""
         self.lifted, self.speed = True, [0.0, 0.0, 0.0]
-        for finger in self.fingers:
-            self._touch(finger, 0.0)
+        self._look()
 
     def lay(self, pose: Sequence[float]) -> None:
         """Lay the object on the platen, at rest."""
         self.lifted, self.pose, self.speed = False, list(pose), [0.0, 0.0, 0.0]
-        for finger in self.fingers:
-            self._touch(finger, 0.0)
+        self._look()
 
     def advance(self, time_s: float, steps: int) -> None:
         """Go on by `time_s` in equal steps; 0.25 ms or less follow the stiffest contacts."""
-        h = time_s / steps
-        for _ in range(steps):
-            self._step(h)
+        self._put()
+        advance_plane(self._plane, time_s / steps, steps)
+        self._take()
         self.time_s += time_s
 
     @property
     def energy(self) -> float:
         """Return the kinetic energy and that of joints, contacts and bristles [J]."""
         vx, vy, w = self.speed
-        total = 0.5 * self.body.mass * (vx * vx + vy * vy) + 0.5 * self._inertia * w * w
-        for finger in self.fingers:
+        total = 0.5 * self._plane.mass * (vx * vx + vy * vy) + 0.5 * self._plane.inertia * w * w
+        self._put()
+        for i, finger in enumerate(self.fingers):
             m, (fx, fy, turn) = finger.mount, finger.speed
             total += 0.5 * m.mass * (fx * fx + fy * fy) + 0.5 * m.inertia * turn * turn
             ex, ey, et = (c - p for c, p in zip(finger.command, finger.place, strict=True))
             total += 0.5 * m.stiffness * (ex * ex + ey * ey) + 0.5 * m.turn_stiffness * et * et
-            chord, area, *_ = self._overlap(finger)
+            chord = overlap_of(self._plane, i)
             if chord > 0.0:
-                depth = 0.75 * area / chord
+                depth = 0.75 * self._plane.found[AREA] / chord
                 radius = 0.5 * chord * chord / depth
                 total += self.skin.stored(depth, radius) * m.length_m
                 total += 0.5 * self.skin.press(depth, radius)[2] * m.length_m * finger.stretch**2
         return total
 
-    def _step(self, h: float) -> None:
-        half, body, speed, pose = 0.5 * h, self.body, self.speed, self.pose
-        pose[0] += half * speed[0]
-        pose[1] += half * speed[1]
-        pose[2] += half * speed[2]
-        fx = fy = moment = 0.0
-        for finger in self.fingers:
-            place, rate, command, own = finger.place, finger.speed, finger.command, finger.rate
-            for i in (0, 1, 2):
-                place[i] += half * rate[i]
-                command[i] += half * own[i]
-            px, py, at_x, at_y = self._touch(finger, h)
-            fx += px
-            fy += py
-            moment += (at_x - pose[0]) * py - (at_y - pose[1]) * px
-            self._push(finger, px, py, at_x, at_y, h)
-            for i in (0, 1, 2):
-                place[i] += half * rate[i]
-                command[i] += half * own[i]
-        self._slide(
-            speed[0] + h * fx / body.mass, speed[1] + h * fy / body.mass, speed[2] + h * moment / self._inertia, h
-        )
-        pose[0] += half * speed[0]
-        pose[1] += half * speed[1]
-        pose[2] += half * speed[2]
+    def _look(self) -> None:
+        """Find the contacts as they are now."""
+        self._put()
+        for i in range(len(self.fingers)):
+            touch_object(self._plane, i, 0.0)
+        self._take()
 
-    def _push(self, finger: Finger, px: float, py: float, at_x: float, at_y: float, h: float) -> None:
-        """Change a finger's velocity by its springs and the contact's reaction; damping by the trapezoidal rule."""
-        m, place, speed, force = finger.mount, finger.place, finger.speed, finger.joint_force
-        twist = -((at_x - place[0]) * py - (at_y - place[1]) * px)
-        for i, stiff, mass, load in (
-            (0, m.stiffness, m.mass, -px),
-            (1, m.stiffness, m.mass, -py),
-            (2, m.turn_stiffness, m.inertia, twist),
-        ):
-            spring = stiff * (finger.command[i] - place[i])
-            damping = 2.0 * m.damping_ratio * math.sqrt(stiff * mass)
-            share = 0.5 * h * damping / mass
-            past = speed[i] - finger.rate[i]
-            after = (past * (1.0 - share) + h * (spring + load) / mass) / (1.0 + share)
-            force[i] = -spring + damping * 0.5 * (past + after)
-            speed[i] = after + finger.rate[i]
+    def _put(self) -> None:
+        """Hand the state to the steps."""
+        state = [*self.pose, *self.speed]
+        for one in self.fingers:
+            state += (
+                *one.place, *one.speed, *one.command, *one.rate, one.normal, one.tangential, one.phi, one.radius_m,
+                one.gap_m, one.slides, one.friction, one.stretch, one.side, *one.joint_force,
+            )  # fmt: skip
+        self._state[:] = state
+        self._plane.lifted = int(self.lifted)
 
-    def _slide(self, vx: float, vy: float, w: float, h: float) -> None:
-        """Take the platen's friction from the object's velocity, at most all of it."""
-        force, turning, mass, inertia = self._most_force, self._most_moment, self.body.mass, self._inertia
-        speed = self.speed
-        if force > 0.0:
-            needed = (mass * mass * (vx * vx + vy * vy)) / (force * force) + (inertia * w / turning) ** 2
-            if needed <= h * h:
-                speed[0] = speed[1] = speed[2] = 0.0
-                return
-            whole = math.sqrt(force * force * (vx * vx + vy * vy) + turning * turning * w * w)
-            keep = 1.0 - min(1.0, h * force * force / (whole * mass))
-            vx, vy, w = vx * keep, vy * keep, w * (1.0 - min(1.0, h * turning * turning / (whole * inertia)))
-        speed[0], speed[1], speed[2] = vx, vy, w
-
-    def _touch(self, finger: Finger, h: float) -> tuple[float, float, float, float]:
-        """Find a finger's contact; return the force on the object [N, N] and where it acts [m, m]."""
-        chord, area, angle, reach, cx, cy = self._overlap(finger)
-        phi = math.remainder(angle - finger.place[2], math.tau)
-        rolled, finger.phi = math.remainder(phi - finger.phi, math.tau), phi
-        if chord <= 0.0:
-            finger.normal = finger.tangential = finger.stretch = 0.0
-            finger.gap_m, finger.slides, finger.radius_m = reach, False, math.inf
-            return 0.0, 0.0, cx, cy
-        m = finger.mount
-        depth = 0.75 * area / chord
-        radius = 0.5 * chord * chord / depth
-        load, width, shear = self.skin.press(depth, radius)
-        nx, ny = math.cos(angle), math.sin(angle)
-        at_x, at_y = cx + reach * nx, cy + reach * ny
-        # the finger's surface there against the object's
-        speed, own, pose = finger.speed, self.speed, self.pose
-        ux = speed[0] - speed[2] * (at_y - finger.place[1]) - own[0] + own[2] * (at_y - pose[1])
-        uy = speed[1] + speed[2] * (at_x - finger.place[0]) - own[1] - own[2] * (at_x - pose[0])
-        closing, across = ux * nx + uy * ny, uy * nx - ux * ny
-        normal = m.length_m * load * max(0.0, 1.0 + m.loss_s * closing)
-        stiff = m.length_m * shear
-        coefficient = m.coefficient(radius, normal)
-        stretch = finger.stretch
-        if m.creep:
-            stretch *= math.exp(-abs(rolled) * reach * width * shear / (2.0 * radius * load))
-        middle = stretch + 0.5 * h * across
-        tangential = stiff * (middle + m.shear_loss_s * across)
-        stretch += h * across
-        most = coefficient * normal
-        finger.slides = abs(tangential) > most
-        if finger.slides:
-            tangential = math.copysign(most, tangential)
-        held = coefficient * m.length_m * load / stiff
-        finger.stretch = min(max(stretch, -held), held)
-        finger.normal, finger.tangential, finger.friction, finger.gap_m = normal, tangential, coefficient, -depth
-        bend = 1.0 / radius - 1.0 / self.skin.outer_m  # below 1/m it is the arc's difference from its parabola
-        finger.radius_m = 1.0 / bend if bend > 1.0 else math.inf
-        return normal * nx - tangential * ny, normal * ny + tangential * nx, at_x, at_y
-
-    def _overlap(self, finger: Finger) -> tuple[float, float, float, float, float, float]:
-        """Return half chord [m], area [m^2], direction of the normal [rad], distance of the contact from the finger's
-        centre [m] and that centre [m, m]; without contact a half chord of 0, and the clearance for the distance.
-        """
-        points, (ox, oy, turn), rb = self._points, self.pose, self.skin.outer_m
-        cx, cy = finger.centre
-        if self.lifted:
-            return 0.0, 0.0, finger.phi + finger.place[2], LOST, cx, cy
-        c, s = math.cos(turn), math.sin(turn)
-        dx, dy = cx - ox, cy - oy
-        u, v = c * dx + s * dy, c * dy - s * dx
-        count, at = len(points), finger.side
-        came = seen = 0
-        while True:  # the side that is nearest to the centre: downhill along the convex outline
-            ax, ay = points[at]
-            bx, by = points[at + 1 - count]
-            ex, ey = bx - ax, by - ay
-            along = (u - ax) * ex + (v - ay) * ey
-            square = ex * ex + ey * ey
-            if came > 0 and along < 0.0:  # a corner between two sides, of which it sees one from behind if it is sharp
-                fx, fy = ax, ay
-                break
-            if came < 0 and along > square:
-                fx, fy = bx, by
-                break
-            if seen < count and ex * (v - ay) - ey * (u - ax) > 0.0:  # it shows this side its back
-                came, at, seen = 0, (at + 1) % count, seen + 1
-                continue
-            if along < 0.0:
-                came, at = -1, (at - 1) % count
-                continue
-            if along > square:
-                came, at = 1, (at + 1) % count
-                continue
-            fx, fy = ax + along / square * ex, ay + along / square * ey
-            break
-        finger.side = at
-        gx, gy = fx - u, fy - v
-        apart = gx * gx + gy * gy
-        limit = rb * rb
-        if apart >= limit:
-            return 0.0, 0.0, turn + math.atan2(gy, gx), math.sqrt(apart) - rb, cx, cy
-        # from the foot along the outline both ways, until it leaves the finger
-        lx, ly, area = gx, gy, 0.0
-        place = at + 1
-        while True:
-            qx, qy = points[place % count]
-            qx, qy = qx - u, qy - v
-            if qx * qx + qy * qy >= limit or place > at + count:
-                break
-            area += (lx - gx) * (qy - gy) - (ly - gy) * (qx - gx)
-            lx, ly, place = qx, qy, place + 1
-        right_x, right_y = _crossing(lx, ly, qx, qy, limit)
-        area += (lx - gx) * (right_y - gy) - (ly - gy) * (right_x - gx)
-        lx, ly, place = gx, gy, at
-        while True:
-            qx, qy = points[place]
-            qx, qy = qx - u, qy - v
-            if qx * qx + qy * qy >= limit or place < at - count + 1:
-                break
-            area -= (lx - gx) * (qy - gy) - (ly - gy) * (qx - gx)
-            lx, ly, place = qx, qy, place - 1
-        left_x, left_y = _crossing(lx, ly, qx, qy, limit)
-        area -= (lx - gx) * (left_y - gy) - (ly - gy) * (left_x - gx)
-        # close by the chord: the cap between outline and chord, then the finger's segment beyond it
-        area += (right_x - gx) * (left_y - gy) - (right_y - gy) * (left_x - gx)
-        cap = 0.5 * area
-        mx, my = 0.5 * (left_x + right_x), 0.5 * (left_y + right_y)
-        chord = 0.5 * math.hypot(right_x - left_x, right_y - left_y)
-        if chord < 1e-9:
-            return 0.0, 0.0, turn + math.atan2(gy, gx), 0.0, cx, cy
-        deep = math.hypot(mx, my)
-        segment = limit * math.atan2(chord, deep) - chord * deep
-        return chord, cap + segment, turn + math.atan2(my, mx), deep - 0.5 * cap / chord, cx, cy
+    def _take(self) -> None:
+        """Take the state from the steps."""
+        state = self._state.tolist()
+        self.pose, self.speed = state[:3], state[3:6]
+        for at, one in zip(range(FINGERS, len(state), LENGTH), self.fingers, strict=True):
+            one.place, one.speed, one.command, one.rate = (state[at + i : at + i + 3] for i in (0, 3, 6, 9))
+            one.normal, one.tangential, one.phi, one.radius_m, one.gap_m, slides, one.friction, one.stretch, side = (
+                state[at + 12 : at + 21]
+            )
+            one.slides, one.side, one.joint_force = slides > 0.0, int(side), state[at + 21 : at + 24]
 
 
-def _between(curve: Sequence[tuple[float, float]], at: float) -> float:
-    """Return the value of a curve of points, beyond its ends that of the end."""
-    if at <= curve[0][0]:
-        return curve[0][1]
-    for (low, first), (high, last) in pairwise(curve):
-        if at < high:
-            return first + (last - first) * (at - low) / (high - low)
-    return curve[-1][1]
-
-
-def _crossing(ax: float, ay: float, bx: float, by: float, limit: float) -> tuple[float, float]:
-    """Return where the line from a within the circle about the origin to b outside crosses it."""
-    ex, ey = bx - ax, by - ay
-    square = ex * ex + ey * ey
-    if square == 0.0:
-        return ax, ay
-    along, inside = ax * ex + ay * ey, limit - ax * ax - ay * ay
-    share = (-along + math.sqrt(max(along * along + square * inside, 0.0))) / square
-    return ax + share * ex, ay + share * ey
+def _plane(body: Body, mounts: Sequence[Mount], rubber: Skin, state: NDArray[np.float64]) -> Plane:
+    """Return what the steps work on."""
+    rows, load, factor = list[float](), list[float](), list[float]()
+    for mount in mounts:
+        own = mount.friction_by_load
+        springs = (number for spring in mount.springs for number in spring)
+        rows += (
+            mount.link_m, *springs, mount.length_m, -1.0 if mount.friction is None else mount.friction, mount.loss_s,
+            mount.shear_loss_s, mount.creep, len(load), len(load) + len(own),
+        )  # fmt: skip
+        load += (at for at, _ in own)
+        factor += (share for _, share in own)
+    most = body.platen_friction * body.mass * GRAVITY
+    bend, rubbing = np.array(FRICTION).T
+    tables = {name: np.array(getattr(rubber, name)) for name in ("product", "half_width", "shear")}
+    return Plane(
+        fingers=len(mounts), points=len(body.outline.points), lifted=0, rows=len(rubber.product), bends=len(FRICTION),
+        mass=float(body.mass), inertia=float(body.mass * body.outline.gyration_m**2), most_force=float(most),
+        most_moment=float(most * _mean_distance(body.outline)), outer_m=float(rubber.outer_m),
+        per_row=float(rubber.step), outline=np.ascontiguousarray(body.outline.points, dtype=np.float64).reshape(-1),
+        state=state, mounts=np.array(rows, dtype=np.float64), found=np.zeros(FOUND),
+        bend=bend.copy(), rubbing=rubbing.copy(), load=np.array(load), factor=np.array(factor), **tables,
+    )  # fmt: skip
 
 
 def _mean_distance(outline: Outline) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from copy import deepcopy
 
 import numpy as np
 import pytest
@@ -331,5 +332,18 @@ def test_a_corner_is_met_by_a_finger_that_sees_one_of_its_sides_from_behind() ->
             apart = world.clearances()[0]
             if apart < -0.5e-3:
                 continue
-            world._touch(finger, 0.0)
+            world._look()
             assert finger.gap_m == pytest.approx(apart, abs=1e-9) if apart > 0.0 else finger.normal > 0.0
+
+
+def test_a_copy_is_a_world_of_its_own() -> None:
+    world = World(Body(disk(20 * MM)), [LOSSLESS], [(-0.17, 0.0, 0.0)])
+    copy = deepcopy(world)
+    for one, to in ((world, -0.168), (copy, -0.17)):
+        one.command([(to, 0.0, 0.0)], 0.1)
+        one.advance(0.1, 400)
+    assert copy.fingers[0].place == [-0.17, 0.0, 0.0] and world.fingers[0].place[0] > -0.169
+    again = deepcopy(copy)
+    again.command([(-0.168, 0.0, 0.0)], 0.1)
+    again.advance(0.1, 400)
+    assert (again.pose, again.fingers[0].place) == (world.pose, world.fingers[0].place)

@@ -10,7 +10,9 @@ from sioms.motion.stop_step import rest_stopped, stop_axes
 from sioms.native import language
 from sioms.plant.effects import build_effects
 from sioms.plant.motor import MotorBank
+from sioms.plant.outline import polygon
 from sioms.plant.parameters import Motor, Wall
+from sioms.plant.planar import Body, Mount, World
 from sioms.plant.stepper import Stepper, StepperBank
 from sioms.protocol.flags import ControlMode, NodeClass
 from sioms.protocol.records import numpy_dtype
@@ -92,9 +94,26 @@ def main():
             for bank in banks:
                 (bank.stop if tick % 1000 == 999 else bank.emergency_stop)([tick // 500 % 5], now)
                 bank.reset(range(5))
+    squeeze(digest)
     assert braked > 25, "most stops are begun by steps"
     kinds = sorted({event.kind.name for bank in banks for event in bank.take_events()})
     print("compiled" if language.library else "python", digest.hexdigest(), refused + left, *kinds)
+
+
+def squeeze(digest):
+    """Two fingers close on a triangle, squeeze it until it slides, and open."""
+    mounts = [Mount(friction=0.6, friction_by_load=((0.2, 1.2), (1.0, 0.9))), Mount(creep=False)]
+    corners = [(-0.03, -0.02), (0.03, -0.02), (0.02, 0.02)]
+    world = World(Body(polygon(corners, 1e-3)), mounts, [(-0.05, 0.14, -1.57), (0.05, -0.14, 1.57)], (2e-3, -3e-3, 0.5))
+    slid = 0
+    for tick in range(1500):
+        in_m = 2e-5 * (min(tick, 900) - 2 * max(tick - 1200, 0))
+        x, turn = 0.05 - in_m, 1.57 + 1e-4 * min(tick, 700)
+        world.command([(-x, 0.14, -1.57), (x, -0.14, turn)], 1e-3)
+        world.advance(1e-3, 4)
+        slid += sum(finger.slides for finger in world.fingers)
+        digest.update(np.array([*world.pose, *world.speed, *(f.tangential for f in world.fingers)]).tobytes())
+    assert slid > 20 and world.fingers[0].normal == 0.0
 
 
 if __name__ == "__main__":
