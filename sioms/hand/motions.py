@@ -41,6 +41,7 @@ class Motions:
         self._missing = [0.0, 0.0]
         self._warned = False
         self._most_n = math.inf  # of each finger by itself
+        self._gone_s = 0.0  # of the last tick
 
     def say(self, text: str, fault: Fault | None = None) -> None:
         """Add an event."""
@@ -169,7 +170,7 @@ class Motions:
         goal: Six = tuple(self._goal)  # type: ignore[assignment]
         rates: Six = tuple(along)  # type: ignore[assignment]
         self.now = yield Setpoint(goal, rates, force, most_n=self._most_n)
-        gone_s = self.now.time_s - last_s
+        gone_s = self._gone_s = self.now.time_s - last_s
         if not gone_s > 0.0:  # every wait would last for ever
             raise Failed(
                 Fault.STALE,

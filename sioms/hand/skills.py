@@ -28,6 +28,7 @@ from sioms.hand.shape import Touch, expected
 from sioms.hand.touch import Failed, Fault, Manner, Reading, Sensed, Setpoint, State
 
 T = TypeVar("T")
+Point = tuple[float, float]
 
 
 class Skills(Feeling):
@@ -80,14 +81,21 @@ class Skills(Feeling):
         """Roll what is held until it is held parallel, or until an array ends; raises as `hold`."""
         return self._guarded("roll", self._roll())
 
-    def hold(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
-        """Hold for a time [s], correcting the friction angles by rolling.
+    def hold(
+        self, time_s: float, along: Point = (0.0, 0.0), rolling: Point | None = None
+    ) -> Generator[Setpoint, Reading, Sensed]:
+        """Hold for a time [s], correcting the friction angles by rolling, and carry it at a velocity x, y [m/s].
+
+        Args:
+            rolling: rates of phi1 and phi2 [rad/s], instead of correcting.
 
         Raises:
             Failed: contact lost, cone, end of the array, overload or a stale sensor.
-            ValueError: a time below 0, or none.
+            ValueError: a time below 0, or none, or a velocity that is none.
         """
-        return self._guarded("hold", self._hold(_lasting(time_s)))
+        if not all(map(math.isfinite, (*along, *(rolling or ())))):
+            raise ValueError(f"hold object: carry it at {along} m/s, roll it at {rolling} rad/s; want finite ones")
+        return self._guarded("hold", self._hold(_lasting(time_s), along, rolling))
 
     def release(self) -> Generator[Setpoint, Reading, None]:
         """Open by the clearance.
@@ -300,9 +308,9 @@ class Skills(Feeling):
         filtered: tuple[float, float] | None = None
         while self.now.time_s - since < 0.15:
             seen = self._seen()
-            filtered = _mixed(filtered, (seen.eta1, seen.eta2), 0.1)
-            yield from self._tick(self._law(filtered))
-            if max(map(abs, filtered)) > 0.5 * manner.tolerance_rad:
+            filtered = self._smoothed(filtered, seen, _ROLL_S)
+            yield from self._tick(self._law(_beyond(filtered, 0.5 * manner.let_rad)))
+            if max(map(abs, filtered)) > max(0.5 * manner.tolerance_rad, manner.let_rad):
                 since = self.now.time_s
             if not all(low < finger.phi < high for finger in self.now.fingers if finger.touched):
                 self.say("the array ends", Fault.ARRAY_END)
@@ -311,6 +319,13 @@ class Skills(Feeling):
                 self.say(f"not parallel after {manner.roll_s:g} s of rolling: {_degrees(seen)}", Fault.NOT_PARALLEL)
                 break
         return (yield from self._sense(manner.force_n))
+
+    def _smoothed(self, last: Point | None, seen: Grasp, time_s: float) -> Point:
+        """Return both friction angles behind a low-pass, whatever the rate of the readings."""
+        if last is None:
+            return seen.eta1, seen.eta2
+        share = min(self._gone_s / time_s, 1.0)
+        return last[0] + share * (seen.eta1 - last[0]), last[1] + share * (seen.eta2 - last[1])
 
     def _law(self, eta: tuple[float, float]) -> tuple[float, float]:
         """Return the rates of rolling [rad/s]."""
@@ -324,15 +339,18 @@ class Skills(Feeling):
             bends.append(1.0 / min(max(self._radii[i], 1e-4), FINGER_M) - 1.0 / FINGER_M)
         return nearest_law(eta, self._seen().apart_m, bends, manner.gain, manner.rolling)
 
-    def _hold(self, time_s: float) -> Generator[Setpoint, Reading, Sensed]:
+    def _hold(
+        self, time_s: float, along: Point = (0.0, 0.0), rolling: Point | None = None
+    ) -> Generator[Setpoint, Reading, Sensed]:
         self.state, self._held = State.HOLD, True
         self._goal[3] = self.hand.forward(self.now.joints)[3]
         end, filtered = self.now.time_s + time_s, None
         while self.now.time_s < end:
             seen = self._seen()
-            filtered = _mixed(filtered, (seen.eta1, seen.eta2), 0.05)
+            filtered = self._smoothed(filtered, seen, _HOLD_S)
             self._watch_cone(max(map(abs, filtered)))
-            yield from self._tick(self._law(filtered))
+            turning = rolling or self._law(_beyond(filtered, self.manner.let_rad))
+            yield from self._follow((*along, 0.0, 0.0, *turning), self.manner.force_n)
         return (yield from self._sense(self.manner.force_n))
 
     def _sense(self, force: float, frames: int = 0) -> Generator[Setpoint, Reading, Sensed]:
@@ -390,6 +408,7 @@ class Skills(Feeling):
         return found
 
 
+_ROLL_S, _HOLD_S = 0.025, 0.05  # low-pass of the friction angles that rolling and holding correct
 _PLACE_RAD = math.radians(0.02)  # what averaging does not take from a place: of the axes' and the array's own
 _HOLLOW = 15.0  # 1/m
 _BESIDE_RAD = math.radians(6.0)  # so near a parallel grasp that was felt the arcs that touch tell it
@@ -419,10 +438,10 @@ def _touches(found: Sensed) -> list[Touch]:
     return touches
 
 
-def _mixed(last: tuple[float, float] | None, new: tuple[float, float], share: float) -> tuple[float, float]:
-    if last is None:
-        return new
-    return last[0] + share * (new[0] - last[0]), last[1] + share * (new[1] - last[1])
+def _beyond(eta: Point, let_rad: float) -> Point:
+    """Return what of friction angles lies beyond what is let be."""
+    one, two = (math.copysign(max(abs(angle) - let_rad, 0.0), angle) for angle in eta)
+    return one, two
 
 
 def _lasting(time_s: float) -> float:

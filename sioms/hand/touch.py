@@ -84,7 +84,7 @@ _MANNERS = {
     "roll_s": (1e-3, 1e5), "clearance_m": (1e-4, 0.1), "tolerance_rad": (1e-6, 1.0), "held_rad": (0.0, 1.0),
     "frames": (1, 100_000), "light_rad": (0.0, math.pi), "squeeze_rad": (0.0, math.pi), "friction": (1e-3, 100.0),
     "most_n": (1e-3, 1e3), "lost_s": (1e-3, 100.0), "stale_s": (1e-3, 100.0), "regrasps": (0, 1000),
-    "tap_n": (1e-3, 1e3), "taps": (0, 1000), "tap_frames": (1, 100_000), "yield_n": (1e-3, 1e3),
+    "let_rad": (0.0, 1.0), "tap_n": (1e-3, 1e3), "taps": (0, 1000), "tap_frames": (1, 100_000), "yield_n": (1e-3, 1e3),
 }  # fmt: skip
 """Bounds of how a skill may be done."""
 
@@ -175,6 +175,7 @@ class Manner:
         clearance_m: by which each finger leaves the object before it moves.
         tolerance_rad: |eta| of a grasp that counts as parallel.
         held_rad: |eta| up to which a grasp is held without another regrasp or roll; holding corrects it.
+        let_rad: |eta| that holding lets be: what sticks to the platen goes by jumps, and swings when all is corrected.
         frames: averaged where a grasp is sensed.
         light_rad: |eta| from which on it warns of the friction cone.
         squeeze_rad: |eta| from which on a touch is not squeezed, but regrasped as it is.
@@ -204,6 +205,7 @@ class Manner:
     clearance_m: float = 8e-3
     tolerance_rad: float = math.radians(0.3)
     held_rad: float = math.radians(1.0)
+    let_rad: float = 0.0
     frames: int = 40
     light_rad: float = math.radians(30.0)
     squeeze_rad: float = math.radians(45.0)

@@ -44,7 +44,7 @@ _NEW_S = 1.0
 _FIRST_S = 10.0
 _WATCHED = 40
 _ENOUGH = 0.5
-MANNER = Manner(light_n=0.4, tap_n=0.06, tap_frames=480)
+MANNER = Manner(light_n=0.4, tap_n=0.06, tap_frames=480, let_rad=math.radians(0.3))
 """Light touches are a little firmer than on the plane, and felt for longer: a frame of a live finger tells a contact
 from 0.14 N on, a mean of 40 from 0.02 N on, and the platen holds an object against one finger with 0.1 to 0.2 N."""
 _TOUCH = ("touched1", "touched2", "force1", "force2")
