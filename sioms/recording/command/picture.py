@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 
 MOST_TOLD = 12
 """Stops and faults that are told in words; all of them are drawn."""
+MOST_DRAWN = 40
+"""Panels of a picture: of more it takes minutes, and of hundreds it would be higher than pictures may be."""
 
 
 @dataclass
@@ -73,10 +75,13 @@ def draw(recording: Recording, nodes: Sequence[str], column: str | None, start_n
     from matplotlib.figure import Figure
 
     drawn, still = panels(recording, nodes, column, start_ns, end_ns)
+    left = dict.fromkeys(panel.title for panel in drawn[MOST_DRAWN:])
+    drawn = drawn[:MOST_DRAWN]
     zero = min((int(stamps[0]) for panel in drawn for _, stamps, _ in panel.curves if len(stamps)), default=0)
     marks = [e for e in recording.events() if e.kind in ("stop", "fault") and start_ns <= e.stamp_ns < end_ns]
     told = [f"{(e.stamp_ns - zero) / 1e9:.3f} s  {sentence(e)}" for e in marks[:MOST_TOLD]] if drawn else []
-    text = told + [f"unchanged: {', '.join(still)}"] * bool(still)
+    text = told + [f"not drawn, name them to see them: {', '.join(left)}"] * bool(left)
+    text += [f"unchanged: {', '.join(still)}"] * bool(still)
     figure = Figure(figsize=(10, 1.2 + 2.0 * len(drawn) + 0.2 * len(text)), layout="constrained")
     FigureCanvasAgg(figure)
     rows: Any = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0] if drawn else []

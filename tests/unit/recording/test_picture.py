@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from recording_rig import NODES, slots, write_slots
 
+from sioms.recording.command import picture
 from sioms.recording.command.picture import draw, panels
 from sioms.recording.reader import Recording
 
@@ -43,6 +44,14 @@ def test_a_picture_has_a_row_a_panel_and_the_text_below(recording: Recording) ->
     figure = draw(recording, [], None, 0, EVER)
     assert [axes.get_ylabel() for axes in figure.axes] == ["[m]", "[rad]", ""]
     assert "unchanged: mod0 b position" in figure.get_supxlabel()
+
+
+def test_what_would_be_too_much_for_a_picture_is_named(recording: Recording, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A workcell of hundreds of axes that all move."""
+    monkeypatch.setattr(picture, "MOST_DRAWN", 2)
+    figure = draw(recording, [], None, 0, EVER)
+    assert [axes.get_ylabel() for axes in figure.axes] == ["[m]", "[rad]"]
+    assert "not drawn, name them to see them: io0.in" in figure.get_supxlabel()
 
 
 def test_where_nothing_changes_there_is_only_text(recording: Recording, tmp_path: Path) -> None:
