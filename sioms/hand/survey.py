@@ -5,7 +5,7 @@
     write(path, survey.rows)
 
 Between grasps the object is turned while it is held, and the fingers are rolled while they are free, so that links and
-fingers are seen from all sides (what decides between look-alikes: docs/reconcile-hand.md). A grasp that fails is left
+fingers are seen from all sides (what decides between confounders: docs/reconcile-hand.md). A grasp that fails is left
 out and said in `events`; the object is then sought where it was last.
 """
 

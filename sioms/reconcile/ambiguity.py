@@ -1,7 +1,7 @@
 """Identifiability: could another effect, or another set, have made these data?
 
-For every named effect the look-alikes take its place and everything is refitted. ``missed`` is the share of
-the effect's contribution that the look-alike cannot reproduce; below ``AMBIGUOUS`` (or within one standard
+For every named effect the confounders take its place and everything is refitted. ``missed`` is the share of
+the effect's contribution that the confounder cannot reproduce; below ``AMBIGUOUS`` (or within one standard
 error on held-out blocks) these data do not tell the two apart, however small the formal intervals are:
 what separates them then is a transient or two, where unmodelled effects live. Where the gate has found, before any
 fit, that two effects leave one and the same trace, more than that is needed: ``ALIKE``.
@@ -20,7 +20,7 @@ import numpy as np
 
 from sioms.reconcile import rules
 from sioms.reconcile.blocks import better
-from sioms.reconcile.bounces import rattles
+from sioms.reconcile.bounces import has_impacts
 from sioms.reconcile.effect import Array, Slot
 from sioms.reconcile.effects import library
 from sioms.reconcile.fit import Fit
@@ -54,7 +54,7 @@ def _wins(r: Rival) -> bool:
 
 
 def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
-    """Refit with each look-alike in the place of each named effect, those not decided by a channel.
+    """Refit with each confounder in the place of each named effect, those not decided by a channel.
 
     Args:
         pairs: effects that leave the same trace, with the share in common, as of ``excitation.Gate``.
@@ -63,7 +63,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     model = found.fit.model
     lib = library()
     alike = {
-        name: [n for n in lookalikes(name) if n in searcher.names and n not in model.effects]
+        name: [n for n in confounders(name) if n in searcher.names and n not in model.effects]
         for name in model.effects
         if name not in searcher.frozen and name in lib
     }
@@ -75,7 +75,7 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
             fit = searcher.searched(searcher.fit(searcher.switched_on(bare, start)))
             if physical(fit, start.effect):
                 allowed = ALIKE if frozenset((name, start.effect)) in same else AMBIGUOUS
-                yield start.effect, fit, ROUGH if rattles(model) else allowed, None
+                yield start.effect, fit, ROUGH if has_impacts(model) else allowed, None
 
     closest = rules.closest(
         [
@@ -89,11 +89,11 @@ def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
             *_for_several(searcher, found),
         ]
     )
-    if rattles(model):
+    if has_impacts(model):
         return closest
     return [
         replace(r, told=told(found.fit, found.losses, r.fit, searcher.loss(r.fit)))
-        if r.missed_little and r.allowed < ALIKE and not rattles(r.fit.model)
+        if r.missed_little and r.allowed < ALIKE and not has_impacts(r.fit.model)
         else r
         for r in closest
     ]
@@ -124,7 +124,7 @@ def _for_several(searcher: Searcher, found: Found) -> Iterator[Rival]:
     """
     lib, model = library(), found.fit.model
     for other in (n for n in searcher.names if n not in model.effects and lib[n].slot is Slot.FORCE):
-        parts = [n for n in model.effects if n in lib[other].lookalikes and n not in searcher.frozen]
+        parts = [n for n in model.effects if n in lib[other].confounders and n not in searcher.frozen]
         if len(parts) < 2:
             continue
         bare = model
@@ -154,9 +154,9 @@ def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
     )
 
 
-def lookalikes(name: str) -> list[str]:
-    """List look-alikes in either direction, without those that merely contain the effect or are contained in it."""
+def confounders(name: str) -> list[str]:
+    """List confounders in either direction, without those that merely contain the effect or are contained in it."""
     lib = library()
-    both = [n for n in lib if n in lib[name].lookalikes or name in lib[n].lookalikes]
+    both = [n for n in lib if n in lib[name].confounders or name in lib[n].confounders]
     contain = [n for n in both if name in lib[n].replaces and size(n) > size(name)]
     return [n for n in both if n not in (*lib[name].replaces, *contain) and size(n) <= size(name) + 1]

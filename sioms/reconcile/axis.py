@@ -13,7 +13,7 @@ import numpy as np
 from sioms.reconcile.ambiguity import rivals, settle
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.blocks import better
-from sioms.reconcile.bounces import rattles
+from sioms.reconcile.bounces import has_impacts
 from sioms.reconcile.changes import change, settled
 from sioms.reconcile.channels import with_resolution
 from sioms.reconcile.conclude import Searched, conclude
@@ -89,7 +89,7 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
         s = _explained(s.ready.beside(force), o)
     s = _foreseen(_plain(_upright(s)), o)
     burst = bursts(s.ready.problem, s.found.fit)
-    o.progress("identifiability: look-alikes in the place of each effect")
+    o.progress("identifiability: confounders in the place of each effect")
     found, others = settle(s.searcher, s.found, s.excited.pairs)
     if found is not s.found:
         s = replace(s, found=found, share=smoother_share(s.ready.problem, found.fit))
@@ -109,11 +109,11 @@ def analyse(session: Session, nominal: AxisModel, options: Options | None = None
 def _foreseen(s: Searched, o: Options) -> Searched:
     """Go back to where a model that runs free came nearer, and settle the refined numbers there."""
     found, searcher, problem, nominal = s.found, s.searcher, s.ready.problem, s.ready.nominal
-    if rattles(found.fit.model) or (loops(problem, nominal) and not nominal.refine):
+    if has_impacts(found.fit.model) or (loops(problem, nominal) and not nominal.refine):
         return s
     o.progress("what the model predicts by itself")
     fit = settled_numbers(problem, nominal, found.fit, searcher.frozen)
-    earlier = [step.model for step in found.ladder if not rattles(step.model)]
+    earlier = [step.model for step in found.path if not has_impacts(step.model)]
     if not loops(problem, nominal) and (plain := nearest(problem, fit.model, earlier)) is not None:
         back = settled_numbers(problem, nominal, refit(problem, plain, searcher.frozen), searcher.frozen)
         fit = back if ahead(problem, back.model) < ahead(problem, fit.model) else fit
@@ -124,7 +124,7 @@ def _foreseen(s: Searched, o: Options) -> Searched:
     gone = [n for n in found.fit.model.effects if n not in fit.model.effects]
     what = ("leave", " and ".join(gone)) if gone else ("refine", " and ".join(nominal.refine))
     step = Step(*what, fit.ratio, 1.0 - fit.cost / found.fit.cost, fit.model)
-    found = Found(fit, searcher.loss(fit), (*found.ladder, step))
+    found = Found(fit, searcher.loss(fit), (*found.path, step))
     return replace(s, found=found, share=smoother_share(problem, fit), rejected=(*s.rejected, *gone))
 
 
@@ -135,7 +135,7 @@ def _upright(s: Searched) -> Searched:
         if name in found.fit.model.effects and leans(found.fit.model, name):
             fit = searcher.fit(varied(found.fit.model.without_effect(name)), 6)
             step = Step("leave", name, fit.ratio, 1.0 - fit.cost / found.fit.cost, fit.model)
-            found = Found(fit, searcher.loss(fit), (*found.ladder, step))
+            found = Found(fit, searcher.loss(fit), (*found.path, step))
     return replace(s, found=found, share=smoother_share(s.ready.problem, found.fit)) if found is not s.found else s
 
 
@@ -172,7 +172,7 @@ def _explained(ready: Prepared, o: Options) -> Searched:
         rejected = tuple(n for n in before.fit.model.effects if n not in found.fit.model.effects)
     elif (
         found.fit.ratio > LOUD
-        and not rattles(found.fit.model)
+        and not has_impacts(found.fit.model)
         and (found.fit.ratio > LARGE or _promising(searcher, ready.model, found))
     ):
         o.progress(f"{found.fit.ratio:.1f} times what is expected remains: searching for a term")
@@ -195,9 +195,9 @@ def _changed(s: Searched) -> Timed | None:
     if s.ready.points or not (odd or warm(model)):  # between rows that are points, anything would pass for a change
         return None
     problem, frozen = s.ready.problem, s.searcher.frozen
-    models = [m for m in (*(step.model for step in s.found.ladder), model) if not (warm(m) or rattles(m))]
+    models = [m for m in (*(step.model for step in s.found.path), model) if not (warm(m) or has_impacts(m))]
     # beside a gap the searcher's fits are of residuals that are bent
-    fits = [refit(problem, m, frozen) if rattles(model) else s.searcher.fit(m) for m in models]
+    fits = [refit(problem, m, frozen) if has_impacts(model) else s.searcher.fit(m) for m in models]
     found = [(fit, course) for fit in fits if (course := change(problem, fit)) is not None]
     least = min((course.left for _, course in found), default=np.inf)
     near = [(f, settled(problem, f, c, frozen)) for f, c in found if c.left <= ROUGHLY * least]
@@ -269,7 +269,7 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
         if earlier:
             found = replace(
                 found,
-                ladder=(*earlier, replace(found.ladder[0], action="noise read again"), *found.ladder[1:]),
+                path=(*earlier, replace(found.path[0], action="noise read again"), *found.path[1:]),
             )
         if turn < AGAIN and (beside := _beside(ready, searcher, found)) is not None:
             o.progress(f"{beside.text}: searching anew beside it")
@@ -284,7 +284,7 @@ def _search(ready: Prepared, o: Options) -> tuple[Prepared, Gate, Searcher, Foun
             break
         what = "what is taken for noise" if misread else "the noise"
         o.progress(f"{what} is {anew.noise.drive / ready.problem.noise.drive:.2f} of what it seemed: searching on")
-        earlier = found.ladder
+        earlier = found.path
         final = replace(anew, weights=None, session=ready.final.session, begin=ready.final.begin, end=ready.final.end)
         ready = replace(ready, problem=anew, final=final)
     return ready, excited, searcher, found
@@ -328,14 +328,14 @@ def _larger(searcher: Searcher, found: Found, excited: Gate) -> tuple[Found, Gat
         searcher.names = names
         return found, excited
     missing = {n: why for n, why in excited.missing.items() if n not in new}
-    return replace(further, ladder=(*found.ladder, *further.ladder[1:])), replace(excited, missing=missing)
+    return replace(further, path=(*found.path, *further.path[1:])), replace(excited, missing=missing)
 
 
 def _beside(ready: Prepared, searcher: Searcher, found: Found) -> Timed | None:
     """Return the force of one frequency that most of what remains is, or that explains more than all that was named."""
     if found.fit.ratio < AXIS.odd:
         return None
-    fits = [found.fit, *(searcher.fit(step.model) for step in found.ladder)]
+    fits = [found.fit, *(searcher.fit(step.model) for step in found.path)]
     lines = [as_timed(line, f) for f in fits if (line := hum(ready.problem, f)) is not None]
     best = min(lines, key=lambda line: line.left, default=None)
     return best if best is not None and best.left < found.fit.cost else None

@@ -37,7 +37,7 @@ class AxisVerdict(Verdict):
     Attributes:
         others: numbers of each alternative, per symbol per effect.
         states: session parameters of the untouched part of each record.
-        rungs: force error on the untouched samples after each step of the ladder, in closed loop where it can be.
+        rungs: force error on the untouched samples after each step of the path, in closed loop where it can be.
     """
 
     rungs: tuple[float, ...]

@@ -31,7 +31,7 @@ OTHERS, OFF = 3, 0.04
 STEPS, TOLERANCE = 4, 1e-3
 
 
-def rattles(model: AxisModel) -> bool:
+def has_impacts(model: AxisModel) -> bool:
     """Say whether there is a gap, whose bounces leave more than noise does."""
     return any(known()[n].mechanism.bounces for n in model.effects)
 

@@ -12,7 +12,7 @@ import numpy as np
 from sioms.reconcile.ambiguity import Rival
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.bends import Bend, bent, loosened
-from sioms.reconcile.bounces import deepest, rattles
+from sioms.reconcile.bounces import deepest, has_impacts
 from sioms.reconcile.controlled import foreign
 from sioms.reconcile.disturbance import disturbance
 from sioms.reconcile.effects import known
@@ -109,7 +109,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     """Conclude.
 
     Args:
-        others: look-alikes in the place of what was found.
+        others: confounders in the place of what was found.
         burst: share of the residual's energy above the quiet level that lies in its loudest tenths of a second.
     """
     ready, found, nominal = s.ready, s.found, s.ready.nominal
@@ -119,7 +119,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     gaps, judged = _gaps(s, states, rng)
     whole = replace(ready.problem, end=1.0, weights=None)
     fit, *others_as_deep = _last(whole, s, rng)
-    fit, changed = (fit, {}) if rattles(fit.model) else halved(whole, fit, s.searcher.frozen)
+    fit, changed = (fit, {}) if has_impacts(fit.model) else halved(whole, fit, s.searcher.frozen)
     tight = _widened(spans_of(whole, fit, others_as_deep), changed)
     spans = _with_room(tight, whole, fit, s.searcher.frozen)
     ends = [(float(r.position.min()), float(r.position.max())) for r in ready.problem.session.records]
@@ -129,7 +129,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     terms += [force.term for force in ready.timed]
     open_rivals = [r for r in others if r.open]
     ratio = found.fit.ratio
-    disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not rattles(found.fit.model)
+    disturbance = ratio > QUIET and burst > BURSTS and s.share < UNEXPLAINED and not has_impacts(found.fit.model)
     odd = ratio > AXIS.odd and s.share > UNEXPLAINED
     leaning = [e for e in named if e.name not in s.searcher.frozen and leans(fit.model, e.name)]
     beyond = ratio > (LARGE if named or terms or ready.points else LOUD)
@@ -157,7 +157,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         notes.append(wave.text)
     if disturbance:
         notes.append(of_bursts(ready.problem, found.fit, burst))
-    elif beyond or (ratio > LOUD and not (ready.points or rattles(found.fit.model))):
+    elif beyond or (ratio > LOUD and not (ready.points or has_impacts(found.fit.model))):
         notes.append(of_much(ratio, s.share))
     if not judged.refusals:
         notes += likened(s.searcher, found)
@@ -172,7 +172,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
     tried += another_law(named, changing, turned)
     if judged.refusals:
         tried += tuple(Candidate(e.name, e.title, REFUSED_FREE) for e in terms if e.name in fit.model.effects)
-    elif said is Outcome.UNEXPLAINED and not rattles(fit.model):
+    elif said is Outcome.UNEXPLAINED and not has_impacts(fit.model):
         tried += idle((ready.problem, ready.final), found.fit.model, (*named, *terms), tried, s.searcher.frozen)
         small = [e for e in named if e.name not in s.searcher.frozen and dwarfed(e, terms)]
         gone = {c.name for c in tried}
@@ -193,7 +193,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         ]
     searched_for = [e for e in found_here if e.name not in s.searcher.frozen]
     # beside a gap the remainder is of bounces, which no other effect can be
-    doubtful = [] if rattles(found.fit.model) else [e.name for e in searched_for if doubted(e, ratio)]
+    doubtful = [] if has_impacts(found.fit.model) else [e.name for e in searched_for if doubted(e, ratio)]
     hanging = [e.name for e in searched_for if e.name not in doubtful and hangs(e.name, tight, spans)]
     for doubts, of in ((doubtful, of_doubts), (hanging, of_hanging)):
         if doubts and said in (Outcome.NAMED, Outcome.AMBIGUOUS):
@@ -210,8 +210,8 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
         alternatives=others_said,
         symbolic=tuple(terms),
         gaps=gaps,
-        ladder=found.ladder,
-        rungs=rungs(ready.final, [step.model for step in found.ladder]),
+        path=found.path,
+        rungs=rungs(ready.final, [step.model for step in found.path]),
         findings=ready.findings,
         missing=s.excited.missing,
         pairs=s.excited.pairs,
@@ -234,7 +234,7 @@ def conclude(s: Searched, o: Options, others: Sequence[Rival], burst: float) -> 
 def _changing(s: Searched, named: Sequence[NamedEffect]) -> list[Uneven]:
     """Return what is named whose numbers are not the same everywhere; beside a gap the remainder is of bounces."""
     fit = s.found.fit
-    if s.searcher.done(fit) or rattles(fit.model):
+    if s.searcher.done(fit) or has_impacts(fit.model):
         return []
     return uneven(s.ready.problem, fit, [e.name for e in named if e.name not in s.searcher.frozen])
 
@@ -242,14 +242,14 @@ def _changing(s: Searched, named: Sequence[NamedEffect]) -> list[Uneven]:
 def _turned(s: Searched, named: Sequence[NamedEffect]) -> list[Bend]:
     """Return what is named whose exponents are others; beside a gap the remainder is of bounces."""
     fit = s.found.fit
-    if rattles(fit.model):
+    if has_impacts(fit.model):
         return []
     return bent(s.ready.problem, fit, [e.name for e in named if e.name not in s.searcher.frozen])
 
 
 def _with_room(spans: Spans, whole: Problem, fit: Fit, frozen: Sequence[str]) -> Spans:
     """Widen intervals by what exponents that the records do not tell leave open."""
-    if rattles(fit.model):
+    if has_impacts(fit.model):
         return spans
     room = loosened(whole, fit, [n for n in fit.model.effects if n not in frozen])
     return _widened(spans, room)
@@ -329,7 +329,7 @@ def _told(gap: Gap, missing: bool) -> Gap:
 def _last(problem: Problem, s: Searched, rng: np.random.Generator) -> tuple[Fit, ...]:
     """Fit once more to all samples; beside a gap the fits from elsewhere come after it."""
     model = s.found.fit.model
-    if rattles(model):
+    if has_impacts(model):
         return deepest(problem, model, s.searcher.frozen, rng)
     fit = refit(problem, model, s.searcher.frozen, LAST)
     worse = fit.cost > float(np.sum(problem.residual(model) ** 2))

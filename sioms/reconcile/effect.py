@@ -189,7 +189,7 @@ class AnyEffect:
     equation: str
     parameters: tuple[Any, ...]
     signature: str
-    lookalikes: tuple[str, ...]
+    confounders: tuple[str, ...]
     separate: str
     neutral: float = 0.0
     session: tuple[str, ...] = ()
@@ -219,7 +219,7 @@ class Effect(AnyEffect):
         beside: effects one of which must be in the model for this one to be tried; none: it may stand alone.
         over: of a law that is laid over what the records show of a variable: which; its last two parameters are the
             middle and the step of its places.
-        takes: (symbol, symbol): in the place of a look-alike that has the second number, the first is that.
+        takes: (symbol, symbol): in the place of a confounder that has the second number, the first is that.
         ratios: (symbol, symbol, most): the first number is at most so many times the second.
     """
 

@@ -1,4 +1,4 @@
-"""What speaks for the effects of a model: intervals of their numbers, what each saves, and the look-alikes it was told
+"""What speaks for the effects of a model: intervals of their numbers, what each saves, and the confounders it was told
 from.
 """
 
@@ -94,13 +94,13 @@ def describe(
         worth = saved, errors, often
         wider = [n for n, other in known().items() if name in other.replaces and size(n) > size(name)]
         named.append(
-            described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, numbers, wider)
+            described(effect, estimates, worth, evidence, others, found.path, fit.model.effects, numbers, wider)
         )
     return apart(sorted(named, key=lambda e: -e.saved))
 
 
 def _numbers(r: Rival) -> str:
-    """Say with which numbers a look-alike stands in the place of an effect."""
+    """Say with which numbers a confounder stands in the place of an effect."""
     model = r.fit.model
     return ", ".join(
         f"{p.symbol} = {model.effects[r.rival][p.symbol]:.4g}" + ("" if model.unit(p) == "1" else f" {model.unit(p)}")

@@ -54,7 +54,7 @@ def gate(problem: Problem, model: AxisModel, names: tuple[str, ...]) -> Gate:
     shown = [n for n in columns if n not in missing]
     for i, a in enumerate(shown):
         for b in shown[i + 1 :]:
-            alike = b in lib[a].lookalikes or a in lib[b].lookalikes
+            alike = b in lib[a].confounders or a in lib[b].confounders
             contained = b in lib[a].replaces or a in lib[b].replaces
             if alike and not contained and (same := common(columns[a], columns[b])) > SAME:
                 pairs.append((a, b, same))

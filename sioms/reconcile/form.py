@@ -9,16 +9,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from sioms.reconcile.bounces import rattles
+from sioms.reconcile.bounces import has_impacts
 from sioms.reconcile.effect import Effect, Over
 from sioms.reconcile.effects import known
 from sioms.reconcile.effects.smooth import CONSTANT, LAWS, PLACES
 from sioms.reconcile.engine.search import Start
 from sioms.reconcile.fit import Fit
-from sioms.reconcile.ladder import Found
 from sioms.reconcile.model import AxisModel
 from sioms.reconcile.plausible import over
 from sioms.reconcile.search import Searcher, Step
+from sioms.reconcile.selection import Found
 from sioms.reconcile.thresholds import GAIN, SURE
 
 
@@ -29,7 +29,7 @@ def of_any_form(searcher: Searcher, found: Found[Fit, AxisModel]) -> Found[Fit, 
         What was found where every name has the form that its variable asks for, or nothing but noise is left.
     """
     model = found.fit.model
-    if searcher.done(found.fit) or rattles(model):
+    if searcher.done(found.fit) or has_impacts(model):
         return found
     best, saved = None, 0.0
     for law in (law for law in LAWS if law.name not in model.effects and _parts(law, model, searcher.frozen)):
@@ -44,7 +44,7 @@ def of_any_form(searcher: Searcher, found: Found[Fit, AxisModel]) -> Found[Fit, 
     if best is None:
         return found
     fit, loss, name = best
-    steps = [*found.ladder, Step("form", name, fit.ratio, saved, fit.model)]
+    steps = [*found.path, Step("form", name, fit.ratio, saved, fit.model)]
     fit, loss = searcher.eliminate(fit, loss, steps)
     return Found(fit, loss, tuple(steps))
 

@@ -16,8 +16,8 @@ from sioms.reconcile.variation import named
 
 
 def plainer(name: str, names: Sequence[str]) -> list[str]:
-    """List the look-alikes with fewer parameters."""
-    return [o for o in known()[name].lookalikes if o in names and size(o) < size(name)]
+    """List the confounders with fewer parameters."""
+    return [o for o in known()[name].confounders if o in names and size(o) < size(name)]
 
 
 def formulas_of(model: AxisModel, law: str, names: Sequence[str]) -> list[tuple[AxisModel, str]]:
@@ -82,9 +82,9 @@ def unspecific(name: str, gains: dict[str, float]) -> bool:
     lib = known()
     family = {
         name,
-        *lib[name].lookalikes,
+        *lib[name].confounders,
         *lib[name].replaces,
-        *(n for n in lib if name in lib[n].lookalikes),
+        *(n for n in lib if name in lib[n].confounders),
     }
     return any(g > NEARLY * gains[name] for n, g in gains.items() if n not in family)
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sioms.reconcile.ambiguity import lookalikes
+from sioms.reconcile.ambiguity import confounders
 from sioms.reconcile.bends import Bend
 from sioms.reconcile.effect import Over
 from sioms.reconcile.effects import known
@@ -41,7 +41,7 @@ def another_law(
     """Refuse the names whose numbers or exponents are others, those that look like them and what hangs on them."""
     laws = {c.effect: REFUSED_UNEVEN.format(c.variable) for c in changing}
     laws |= {b.effect: REFUSED_BENT.format(b.what) for b in turned}
-    alike = {other: REFUSED_ALIKE for name in laws for other in lookalikes(name)}
+    alike = {other: REFUSED_ALIKE for name in laws for other in confounders(name)}
     why = alike | {name: REFUSED_HANGS for b in turned for name in b.hangs} | laws
     return tuple(Candidate(e.name, e.title, why[e.name]) for e in named if e.name in why)
 

@@ -1,4 +1,4 @@
-"""When an effect counts, and when a look-alike is ruled out (decision 0063): alike for axes and sensors."""
+"""When an effect counts, and when a confounder is ruled out (decision 0063): alike for axes and sensors."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from sioms.reconcile.blocks import better
 from sioms.reconcile.effect import Array
-from sioms.reconcile.ladder import Found, Step
+from sioms.reconcile.selection import Found, Step
 from sioms.reconcile.thresholds import DOUBTFUL, GAIN, SWAPS
 
 
@@ -33,7 +33,7 @@ def negligible(lost: float, errors: float) -> bool:
 
 @dataclass(frozen=True)  # with slots, calling Rival[Fit] fails in Python 3.11: typing sets an attribute of its own
 class Rival(Generic[F]):
-    """A look-alike refitted in the place of a named effect.
+    """A confounder refitted in the place of a named effect.
 
     Attributes:
         missed: share of the contribution of ``effect`` that it cannot reproduce.
@@ -70,17 +70,17 @@ def weighed(
     replacements: Callable[[F, str, float], Iterable[tuple[str, F, float, float | None]]],
     loss: Callable[[F], Array],
 ) -> list[Rival[F]]:
-    """Refit look-alikes in the place of each named effect.
+    """Refit confounders in the place of each named effect.
 
     Args:
         names: effects that may be another.
         bare: fit without one of them.
-        replacements: of the fit without an effect, its name and what it contributes: yields a look-alike, its fit, the
+        replacements: of the fit without an effect, its name and what it contributes: yields a confounder, its fit, the
             share that it must miss to be ruled out, and the share that it misses where that is not told by the costs.
         loss: held-out loss of each block.
 
     Returns:
-        Of each look-alike of each effect the fit that misses least, the closest first.
+        Of each confounder of each effect the fit that misses least, the closest first.
     """
     out = []
     for name in names:
@@ -96,7 +96,7 @@ def weighed(
 
 
 def closest(rivals: Iterable[Rival[F]]) -> list[Rival[F]]:
-    """Keep of each look-alike of each effect the fit that misses least, the closest first."""
+    """Keep of each confounder of each effect the fit that misses least, the closest first."""
     best: dict[tuple[str, str], Rival[F]] = {}
     for r in rivals:
         if (r.effect, r.rival) not in best or r.missed < best[r.effect, r.rival].missed:
@@ -106,13 +106,13 @@ def closest(rivals: Iterable[Rival[F]]) -> list[Rival[F]]:
 
 def told_apart(
     name: str,
-    lookalikes: Container[str],
+    confounders: Container[str],
     rivals: Iterable[Rival[F]],
-    ladder: Iterable[Step[Any]],
+    path: Iterable[Step[Any]],
     present: Container[str],
     wider: Container[str] = (),
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Say of each look-alike of a named effect why it is ruled out, or why it is not.
+    """Say of each confounder of a named effect why it is ruled out, or why it is not.
 
     Args:
         present: effects of the model, which rule nothing out.
@@ -129,10 +129,10 @@ def told_apart(
         rival: "contains this effect, and explains no more with more parameters"
         if rival in wider and gain < step.saved + GAIN
         else f"removed {100 * gain:.3g} % of the residual where this effect removed {100 * step.saved:.3g} %"
-        for step in ladder
+        for step in path
         if step.effect == name
         for rival, gain in step.rivals.items()
-        if rival in lookalikes and rival not in present and rival not in still
+        if rival in confounders and rival not in present and rival not in still
     }
     refitted = {
         r.rival: r.told
@@ -153,7 +153,7 @@ def settle(
 ) -> tuple[Found[F, M], list[Rival[F]]]:
     """Find the rivals; where one does better than what is named, search on from it, ``SWAPS`` times at most.
 
-    A step adds what saves most beside the effects of that moment; what came later may have made a look-alike the better
+    A step adds what saves most beside the effects of that moment; what came later may have made a confounder the better
     one.
 
     Args:
@@ -171,6 +171,6 @@ def settle(
         further = search(best.fit.model)
         saved = 1.0 - best.fit.cost / found.fit.cost
         step = Step("swap", f"{best.effect} to {best.rival}", ratio(best.fit), saved, best.fit.model)
-        found = Found(further.fit, further.losses, (*found.ladder, step, *further.ladder[1:]))
+        found = Found(further.fit, further.losses, (*found.path, step, *further.path[1:]))
         others = rivals(found)
     return found, others

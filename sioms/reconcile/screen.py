@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.signal import butter, sosfiltfilt
 
-from sioms.reconcile.bounces import rattles
+from sioms.reconcile.bounces import has_impacts
 from sioms.reconcile.dry import dry_friction
 from sioms.reconcile.effect import Array, Effect, Over, Parameter, Ref, Seen, Slot, Trials
 from sioms.reconcile.effects import known
@@ -346,7 +346,7 @@ def trial_values(
         model.max_speed,
         max(float(np.max(np.abs(r.force))) for r in records),
         max(float(np.ptp(r.position)) for r in records),
-        rattles(model),
+        has_impacts(model),
         waves,
     )
     for guess in effect.trials.guesses(seen) if effect.trials is not None else ():

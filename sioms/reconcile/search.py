@@ -12,9 +12,9 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile import ladder
+from sioms.reconcile import selection
 from sioms.reconcile.blocks import better, heldout
-from sioms.reconcile.bounces import POLISHED, UNPOLISHED, bent, polish, rattles, rough, spread
+from sioms.reconcile.bounces import POLISHED, UNPOLISHED, bent, has_impacts, polish, rough, spread
 from sioms.reconcile.effect import Array
 from sioms.reconcile.effects import known, library
 from sioms.reconcile.engine.search import AND, Added, Saving, Search, Start, Tried
@@ -45,8 +45,8 @@ WORTH = 2.0  # and not where another candidate leaves less by this factor
 KEPT_BYTES = 128_000_000
 
 
-Step = ladder.Step[AxisModel]
-Found = ladder.Found[Fit, AxisModel]
+Step = selection.Step[AxisModel]
+Found = selection.Found[Fit, AxisModel]
 
 
 @dataclass(slots=True)
@@ -117,7 +117,7 @@ class Searcher(Search[AxisModel]):
 
     def searched(self, fit: Fit, best: float = np.inf) -> Fit:
         """Search the numbers of a gap, if there is one, until that no longer gains, or is too far from the best."""
-        for _ in range(PASSES if rattles(fit.model) else 0):
+        for _ in range(PASSES if has_impacts(fit.model) else 0):
             if fit.cost > WORTH * best:
                 break
             again = polish(self._given, self.problem, fit.model, self.frozen, UNPOLISHED)
@@ -140,7 +140,7 @@ class Searcher(Search[AxisModel]):
         if len(self.ids) != len(fit.residual):
             self.ids = block_ids(self.problem, fit.model.sample_time_s)
         losses = heldout(
-            replace(fit, jacobian=fit.jacobian[:, :0]) if rattles(fit.model) else fit,
+            replace(fit, jacobian=fit.jacobian[:, :0]) if has_impacts(fit.model) else fit,
             self.ids,
             moved=lambda d: self.problem.residual(shifted(fit.model, fit.free, d)),
         )
@@ -172,9 +172,9 @@ class Searcher(Search[AxisModel]):
         return self._straight(self.fit(model))
 
     def _straight(self, fit: Fit) -> Fit:
-        if not rattles(fit.model) and self.problem is self._given:
+        if not has_impacts(fit.model) and self.problem is self._given:
             return fit
-        self.problem = bent(self._given, fit.model) if rattles(fit.model) else self._given
+        self.problem = bent(self._given, fit.model) if has_impacts(fit.model) else self._given
         self._fits.clear()
         self._losses.clear()
         self._starts.clear()
@@ -184,14 +184,14 @@ class Searcher(Search[AxisModel]):
     def settle_step(self, added: Added[AxisModel]) -> tuple[Fit, Array]:
         """Search the numbers of a gap again: beside what is new they may be others."""
         fit, losses, _ = added
-        if rattles(fit.model):
+        if has_impacts(fit.model):
             fit = self._straight(self.searched(fit))
             losses = self.loss(fit)
         return fit, losses
 
     def settle_model(self, fit: Fit, losses: Array) -> tuple[Fit, Array]:
         """Straighten the residual where a gap has left."""
-        if not rattles(fit.model) and self.problem is not self._given:
+        if not has_impacts(fit.model) and self.problem is not self._given:
             fit = self._straight(fit)
             losses = self.loss(fit)
         return fit, losses
@@ -200,7 +200,7 @@ class Searcher(Search[AxisModel]):
         """Take back what a searched order enriched, unless it saves half: where much is unexplained some order always
         fits.
         """
-        fit, losses, steps = found.fit, found.losses, list(found.ladder)
+        fit, losses, steps = found.fit, found.losses, list(found.path)
         for name in [n for n in fit.model.effects if n not in self.frozen and self._enrichment(n)]:
             other = next(o for o in plainer(name, self.names) if o in known()[name].replaces)
             new = self.fit(swapped(fit.model, name, other), 6)
@@ -212,7 +212,7 @@ class Searcher(Search[AxisModel]):
         return Found(fit, losses, tuple(steps))
 
     def candidates(self, fit: Fit, passed: int = 0) -> list[Start]:
-        """Screen what may be added: the best few after so many, and their look-alikes."""
+        """Screen what may be added: the best few after so many, and their confounders."""
         names = [
             n
             for n in self.names
@@ -227,7 +227,7 @@ class Searcher(Search[AxisModel]):
         starts.sort(key=lambda s: -s.gain)
         chosen, further = starts[passed : passed + AXIS.tries], starts[passed + AXIS.tries :]
         if chosen:
-            alike = known()[chosen[0].effect].lookalikes
+            alike = known()[chosen[0].effect].confounders
             chosen += [s for s in further if s.effect in alike and s.gain > 0.3 * chosen[0].gain]
         return chosen
 
@@ -265,7 +265,7 @@ class Searcher(Search[AxisModel]):
             self._try(tried, s.effect, self._with(fit, s, 8 if s is chosen[0] else 5, best), losses)
         for effect, new in self._enriched(tried):
             self._try(tried, effect, new, losses)
-        for effect in sorted(tried, key=lambda n: -tried[n].saved.share)[:BEST] if rattles(fit.model) else ():
+        for effect in sorted(tried, key=lambda n: -tried[n].saved.share)[:BEST] if has_impacts(fit.model) else ():
             self._try(tried, effect, self.searched(tried[effect].fit), losses)
         if max((t.saved.share for t in tried.values()), default=0.0) < CLEAR:
             for effect, new in self._afresh(fit):
@@ -315,7 +315,7 @@ class Searcher(Search[AxisModel]):
 
         Beside a gap, whose bounces fall out otherwise with any other number, a small saving says nothing.
         """
-        least = SPECIFIC if rattles(fit.model) else GAIN
+        least = SPECIFIC if has_impacts(fit.model) else GAIN
         sure = {n: t for n, t in tried.items() if self.surely(t.saved, least, n)}
         good = {n: t for n, t in sure.items() if self.sound(t.fit, fit)}
         best = max(sure, key=lambda n: sure[n].saved.share, default=None)
@@ -427,7 +427,7 @@ class Searcher(Search[AxisModel]):
         return small(fit.model, name)
 
     def simpler(self, fit: Fit, name: str) -> Iterator[tuple[str, str, Fit]]:
-        """Yield look-alikes of fewer parameters in the place of an effect, and formulas in that of a law that is one of
+        """Yield confounders of fewer parameters in the place of an effect, and formulas in that of a law that is one of
         them.
         """
         for model, other in formulas_of(fit.model, name, self.names):

@@ -159,10 +159,10 @@ CLIPPED = 0.1
 no friction. Two axes of seeds 972801 and 972802 without the effect they hide: 0.73 and 0.48; what was there 0
 (1041)."""
 
-# --- when a look-alike is ruled out
+# --- when a confounder is ruled out
 
 AMBIGUOUS = 0.015
-"""Share of an effect's contribution that a look-alike must miss: pairs made alike missed 0.0 to 1.3 %, pairs told apart
+"""Share of an effect's contribution that a confounder must miss: pairs made alike missed 0.0 to 1.3 %, pairs told apart
 by full records 4 % and more. Forty axes (0063).
 """
 ALIKE = 0.05
@@ -172,7 +172,7 @@ ALIKE = 0.05
 SAME_TRACE = 0.98
 """Share of energy in common from which on two traces are one, for ``ALIKE``. Seeds 101 and 202 (0069)."""
 FAR_WORSE, EACH_BLOCK, NEARLY_EACH = 9.0, 4.6, 0.9
-"""A look-alike that misses less than ``AMBIGUOUS`` is ruled out all the same beside a model that comes down to the
+"""A confounder that misses less than ``AMBIGUOUS`` is ruled out all the same beside a model that comes down to the
 noise, where it leaves so many times more squares in addition (so that nothing unmodelled in what that leaves could make
 the difference), and where so large a share of the blocks of time tells it by itself: by the logarithm of the likelihood
 of held-out rows, counted as independent ones, a hundred to one. Ten axes at one speed (seed 973102), where a transient
@@ -181,11 +181,11 @@ times, in all (1046)."""
 SAME = 0.95
 """The same for what the report says looks alike in these records."""
 ROUGH = 0.1
-"""What a look-alike must miss beside a gap, whose bounces fall out otherwise with every other number. Eleven axes with
+"""What a confounder must miss beside a gap, whose bounces fall out otherwise with every other number. Eleven axes with
 a gap (0080).
 """
 SWAPS = 2
-"""Look-alikes that take the place of what is named, one after the other."""
+"""Confounders that take the place of what is named, one after the other."""
 
 # --- when something is missing that has no name
 
@@ -266,14 +266,14 @@ periods a turn of a detent, on two turns: two places; true cogging of 14 periods
 UNEVEN, UNEVEN_PATH = 0.08, 0.5
 """What is named has another law where the first share of what remains is explained, surely, once its numbers may change
 with a variable; of friction that builds up over a path, the second. Some hundred axes fitted with the right effects
-(seeds 981601 to 981604 and the forty): 0.06 at most, of friction that builds up 0.36; fifteen look-alikes in the place
+(seeds 981601 to 981604 and the forty): 0.06 at most, of friction that builds up 0.36; fifteen confounders in the place
 of other laws: 0.08 to 0.98, of friction that builds up 0.62 to 0.77 (1056). Seed 770003, not seen when they were set:
 42 right axes 0.01 at most, of friction that builds up 0.28; of 24 near laws (seed 770004) 15 are beyond (1053)."""
 
 EXPONENT, EXPONENT_PATH, EXPONENT_ERRORS = 0.1, 0.3, 3.0
 """What is named has another law where its exponent comes to another value by the first number at least, beside friction
 that builds up over a path by the second, and by so many standard errors. Eighty-one drawn axes fitted with the right
-effects (seeds 770002 and 770003): 0.012 at most at three standard errors, beside what builds up 0.11; look-alikes in
+effects (seeds 770002 and 770003): 0.012 at most at three standard errors, beside what builds up 0.11; confounders in
 the place of forty near laws (seed 770004), 32 fits of 50: 0.14 and more (1053)."""
 NEIGHBOUR, HANGS = 0.5, 0.1
 """The neighbours of a law differ from it in its exponent by the first number (one standard deviation: a drop with the
@@ -394,4 +394,4 @@ MOST_INSIDE = 0.7
 SHARPER = 0.6
 """Share of a stated floor below which the one told beside a model counts (0074)."""
 FELT = 3.0
-"""Standard deviations that an element's own number must make for its look-alikes to be told by it."""
+"""Standard deviations that an element's own number must make for its confounders to be told by it."""

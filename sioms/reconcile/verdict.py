@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from sioms.reconcile.effect import TERM_PREFIX, Array
 from sioms.reconcile.errors import BadInputError
-from sioms.reconcile.ladder import Step
+from sioms.reconcile.selection import Step
 
 __all__ = [
     "EXIT", "EXIT_BAD_INPUT", "BadInputError", "Candidate", "Estimate", "Gap", "NamedEffect", "Outcome", "Place",
@@ -52,7 +52,7 @@ class NamedEffect:
         saved: share of the remaining residual energy that it explains, beyond all the others.
         errors: standard errors of that, over blocks.
         frequency: share of block bootstrap replicates in which it earns its place; None where that was not tried.
-        evidence: sentences; ruled_out, open: look-alikes with the reason.
+        evidence: sentences; ruled_out, open: confounders with the reason.
     """
 
     name: str
@@ -170,7 +170,7 @@ class Verdict:
     alternatives: tuple[tuple[str, ...], ...]
     symbolic: tuple[NamedEffect, ...]
     gaps: tuple[Gap, ...]
-    ladder: tuple[Step[Any], ...]
+    path: tuple[Step[Any], ...]
     missing: dict[str, str]
     pairs: tuple[tuple[str, str, float], ...]
     places: tuple[Place, ...]

@@ -38,7 +38,7 @@ class Axis:
         current, marks: whether the drive's current and index marks are recorded.
         seed: of its commands and noise.
         named, nameless: hidden effects with their parameters.
-        rival: the look-alike of a confounded effect.
+        rival: the confounder of a confounded effect.
     """
 
     name: str

@@ -107,7 +107,7 @@ BESIDE = {
     "detent": ("viscous", "payload"),
     **BESIDE_NEAR,
 }
-#: Only a measured current, or index marks, tell these from their look-alikes.
+#: Only a measured current, or index marks, tell these from their confounders.
 BY_CURRENT, BY_MARKS = {"delay", "lag", "saturation"}, {"payload", "encoder_scale"}
 #: Effects of angle, and a frequent sample time for each rare one.
 TURNING = ("gravity", "swinging_inertia")
@@ -202,7 +202,7 @@ def _drawn(name: str, kind: str, rng: np.random.Generator, only: str) -> Axis:
 
 
 def _alike(name: str, excitation: str, axis: Axis, numbers: Numbers, rng: np.random.Generator) -> Numbers:
-    """Make an effect one with its look-alike where the excitation is poor, or a channel is missing."""
+    """Make an effect one with its confounder where the excitation is poor, or a channel is missing."""
     match excitation, name:
         case "small", "gravity":  # near the horizontal, where a little travel does not show its slope
             drawn = numbers["phase"]

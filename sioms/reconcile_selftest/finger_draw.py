@@ -53,7 +53,7 @@ class HiddenFinger:
     Attributes:
         kind: null, single, multi, confounded or unknown.
         named, nameless: hidden effects with their parameters; values of elements are arrays.
-        rival: the look-alike of a confounded effect.
+        rival: the confounder of a confounded effect.
         one_place: all touches are made at one place.
     """
 

@@ -121,7 +121,7 @@ def test_a_users_own_effect_acts_in_the_twin(monkeypatch: pytest.MonkeyPatch) ->
     own = Effect(
         name="detent", title="detent", channel=Channel.MECHANICS, slot=Slot.FORCE, function=detent,
         equation="F = -h tanh(5 x)", parameters=(Parameter("h", "{F}", Ref.FORCE, 0.0, 1.0, 0.05, "height"),),
-        signature="at zero", lookalikes=("spring",), separate="the whole range",
+        signature="at zero", confounders=("spring",), separate="the whole range",
     )  # fmt: skip
     monkeypatch.setitem(known(), "detent", own)
     twin, _ = driven(replace(AXIS, effects={"detent": {"h": 0.06}}))

@@ -155,7 +155,7 @@ def cruising(session: object, node: str) -> float:
 
 
 @pytest.mark.timeout(600)
-def test_two_effects_that_look_alike_are_told_apart_by_the_experiment_it_designs(
+def test_two_effects_that_confounder_are_told_apart_by_the_experiment_it_designs(
     start_daemon: Callable[..., Daemon], tmp_path: Path
 ) -> None:
     """An arm that moves little about the horizontal feels its weight as a constant force; a long way decides."""

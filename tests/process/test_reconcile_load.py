@@ -106,7 +106,7 @@ def said(run: Running) -> str:
 
 
 @pytest.mark.timeout(600)
-def test_two_effects_that_look_alike_are_told_apart_by_the_other_load_and_the_twin_takes_the_model(
+def test_two_effects_that_confounder_are_told_apart_by_the_other_load_and_the_twin_takes_the_model(
     daemon: Daemon, tmp_path: Path
 ) -> None:
     """With one lever arm the torque is always in one proportion to the force: its gain passes for cross-talk from the

@@ -33,7 +33,7 @@ DEAD_BAND = Effect(
     equation="F = u - clip(u, -w, w): nothing within w of zero, and w less beyond",
     parameters=(Parameter("w", "{F}", Ref.FORCE, 0.0, 1.0, 0.05, "half width of the dead band", shape=True),),
     signature="force residual against the command, of one size from a small command on",
-    lookalikes=("coulomb", "load_friction", "gain_asymmetry"),
+    confounders=("coulomb", "load_friction", "gain_asymmetry"),
     separate="force steps about zero while the axis moves on",
 )
 GAIN_ASYMMETRY = Effect(
@@ -47,7 +47,7 @@ GAIN_ASYMMETRY = Effect(
         Parameter("d", "1", Ref.ONE, -0.6, 0.6, 0.03, "half the difference of the force constants", least=0.004),
     ),
     signature="force residual with the size of the motor force, the same way for both its signs",
-    lookalikes=("offset", "viscous_direction", "asymmetric_spring", "dead_band"),
+    confounders=("offset", "viscous_direction", "asymmetric_spring", "dead_band"),
     separate="the same moves both ways, with two loads",
 )
 

@@ -56,7 +56,7 @@ POWER_DRAG = Effect(
         Parameter("n", "1", Ref.ONE, 0.3, 3.5, 1.5, "exponent", shape=True, vanishes=True),
     ),
     signature="force residual that grows with a power of speed, odd in direction",
-    lookalikes=("viscous", "quadratic_drag", "coulomb"),
+    confounders=("viscous", "quadratic_drag", "coulomb"),
     separate="cruise at several speeds up to the largest, both ways",
     replaces=("viscous", "quadratic_drag"),
 )
@@ -69,7 +69,7 @@ QUADRATIC_DIRECTION = Effect(
     equation="F = -c v^2: the drag coefficient is larger by c forward, smaller by c backward",
     parameters=(Parameter("c", "{F} s^2/{x}^2", Ref.DRAG, -1.0, 1.0, 0.03, "half the difference of the coefficients"),),
     signature="force residual with the square of speed, even in direction",
-    lookalikes=("viscous_direction", "offset"),
+    confounders=("viscous_direction", "offset"),
     separate="cruise at several speeds both ways, and rest",
 )
 LOAD_SQUARE_FRICTION = Effect(
@@ -81,7 +81,7 @@ LOAD_SQUARE_FRICTION = Effect(
     equation="F = -g u^2 sign(v)",
     parameters=(Parameter("g", "1/({F})", Ref.PER_FORCE, 0.0, 3.0, 0.1, "loss per squared transmitted force"),),
     signature="force residual opposes motion and grows with the square of the motor force",
-    lookalikes=("load_friction", "coulomb", "thermal_gain"),
+    confounders=("load_friction", "coulomb", "thermal_gain"),
     separate="the same speeds at several accelerations or loads",
 )
 WARMING_FRICTION = Effect(
@@ -98,7 +98,7 @@ WARMING_FRICTION = Effect(
         Parameter("tau", "s", Ref.TIME, 0.5, 1e4, 10.0, "time over which it does", soft=True),
     ),
     signature="force residual with the direction of motion that goes with how much the axis moved before",
-    lookalikes=("coulomb", "thermal_gain", "viscous"),
+    confounders=("coulomb", "thermal_gain", "viscous"),
     separate="the same slow move cold, and after a minute of fast ones",
     session=("how warm it is at the start",),
     replaces=("thermal_gain",),

@@ -61,7 +61,7 @@ TORQUE_RIPPLE = Effect(
         Parameter("n", "1/pitch", Ref.ONE, 1.0, 60.0, 1.0, "periods in a pitch", fixed=True),
     ),
     signature="periodic force residual in position, proportional to the motor force",
-    lookalikes=("cogging", "eccentricity"),
+    confounders=("cogging", "eccentricity"),
     separate="one full turn with two loads",
 )
 DELAY = Effect(
@@ -73,7 +73,7 @@ DELAY = Effect(
     equation="F(t) = u(t - delay)",
     parameters=(Parameter("delay", "s", Ref.TIME, 0.0, 0.02, 1.5e-3, "delay of the command"),),
     signature="force residual with the rate of the command; measured current late by a constant time",
-    lookalikes=("lag", "elastic"),
+    confounders=("lag", "elastic"),
     separate="force steps, or a multi-sine up to the bandwidth",
 )
 LAG = Effect(
@@ -85,7 +85,7 @@ LAG = Effect(
     equation="tau dF/dt = u - F",
     parameters=(Parameter("tau", "s", Ref.TIME, 0.0, 0.02, 1.5e-3, "time constant of the drive"),),
     signature="as a delay, with the fast part attenuated",
-    lookalikes=("delay", "elastic"),
+    confounders=("delay", "elastic"),
     separate="force steps",
 )
 SATURATION = Effect(
@@ -98,7 +98,7 @@ SATURATION = Effect(
     equation="F = clip(u, -limit, limit)",
     parameters=(Parameter("limit", "{F}", Ref.FORCE, 0.02, 10.0, 0.5, "largest force"),),
     signature="force residual only where the command is large",
-    lookalikes=("thermal_gain", "load_friction"),
+    confounders=("thermal_gain", "load_friction"),
     separate="force steps of growing height",
 )
 THERMAL_GAIN = Effect(
@@ -113,7 +113,7 @@ THERMAL_GAIN = Effect(
         Parameter("tau", "s", Ref.TIME, 0.5, 1e4, 10.0, "thermal time constant", soft=True),
     ),
     signature="force residual proportional to the motor force, growing with the heat put in",
-    lookalikes=("payload", "load_friction", "saturation"),
+    confounders=("payload", "load_friction", "saturation"),
     separate="the same record cold and warm, in both orders",
     session=("temperature at the start",),
 )

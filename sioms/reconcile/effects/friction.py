@@ -130,7 +130,7 @@ VISCOUS = Effect(
     equation="F = -b_extra v",
     parameters=(Parameter("b_extra", "{F} s/{x}", Ref.DAMPING, 0.0, 5.0, 0.05, "added viscous coefficient"),),
     signature="force residual proportional to speed, odd in direction",
-    lookalikes=("coulomb", "quadratic_drag", "viscous_direction"),
+    confounders=("coulomb", "quadratic_drag", "viscous_direction"),
     separate="cruise at several speeds both ways",
 )
 VISCOUS_DIRECTION = Effect(
@@ -152,7 +152,7 @@ VISCOUS_DIRECTION = Effect(
         ),
     ),
     signature="force residual proportional to speed, even in direction",
-    lookalikes=("offset",),
+    confounders=("offset",),
     separate="cruise at several speeds both ways, and rest",
 )
 QUADRATIC_DRAG = Effect(
@@ -164,7 +164,7 @@ QUADRATIC_DRAG = Effect(
     equation="F = -c v |v|",
     parameters=(Parameter("c", "{F} s^2/{x}^2", Ref.DRAG, 0.0, 5.0, 0.05, "drag coefficient"),),
     signature="force residual with the square of speed, odd in direction",
-    lookalikes=("viscous",),
+    confounders=("viscous",),
     separate="cruise at several speeds up to the largest, both ways",
 )
 COULOMB = Effect(
@@ -176,7 +176,7 @@ COULOMB = Effect(
     equation="F = -Fc sign(v); at rest it holds any force up to Fc",
     parameters=(Parameter("Fc", "{F}", Ref.FORCE, 0.0, 1.5, 0.05, "friction level"),),
     signature="force residual steps with the direction of motion and does not depend on speed",
-    lookalikes=("stribeck", "viscous", "offset", "presliding", "dead_band"),
+    confounders=("stribeck", "viscous", "offset", "presliding", "dead_band"),
     separate="slow reversals and cruise at several speeds both ways",
     replaces=("stribeck", "presliding", "lugre", "coulomb_position"),
 )
@@ -194,7 +194,7 @@ COULOMB_POSITION = Effect(
         Parameter("n", "1/pitch", Ref.ONE, 1.0, 60.0, 1.0, "periods in a pitch", fixed=True),
     ),
     signature="periodic force residual whose sign follows the direction of motion",
-    lookalikes=("coulomb", "cogging", "torque_ripple"),
+    confounders=("coulomb", "cogging", "torque_ripple"),
     separate="one full turn at constant speed, both ways",
     replaces=("coulomb", "stribeck", "presliding", "lugre"),
 )
@@ -211,7 +211,7 @@ STRIBECK = Effect(
         Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops"),
     ),
     signature="as Coulomb friction, larger below the Stribeck speed",
-    lookalikes=("coulomb", "presliding", "backlash"),
+    confounders=("coulomb", "presliding", "backlash"),
     separate="reversals at several low speeds",
     ratios=(("Fs", "Fc", 5.0), ("Fc", "Fs", 1.0)),
     replaces=("coulomb", "presliding", "lugre", "coulomb_position"),
@@ -238,7 +238,7 @@ PRESLIDING = Effect(
         ),
     ),
     signature="friction force builds up over a displacement after every reversal",
-    lookalikes=("coulomb", "stribeck", "backlash"),
+    confounders=("coulomb", "stribeck", "backlash"),
     separate="small reversals of several amplitudes",
     session=("state at the start",),
     replaces=("coulomb", "stribeck", "lugre", "coulomb_position"),
@@ -267,7 +267,7 @@ LUGRE = Effect(
         Parameter("vs", "{x}/s", Ref.SPEED, 2e-4, 0.5, 0.02, "speed over which the level drops", vanishes=True),
     ),
     signature="friction force builds up over a displacement after every reversal and drops with the speed",
-    lookalikes=("stribeck", "presliding", "coulomb", "backlash"),
+    confounders=("stribeck", "presliding", "coulomb", "backlash"),
     separate="small reversals of several amplitudes, and reversals at several low speeds",
     session=("state at the start",),
     ratios=(("Fs", "Fc", 5.0), ("Fc", "Fs", 1.0)),
@@ -287,7 +287,7 @@ FRICTION_VARIATION = Effect(
     ),
     signature="periodic force residual whose sign follows the direction of motion, as large as the dry friction is at "
     "that speed",
-    lookalikes=("torque_ripple", "cogging", "coulomb_position"),
+    confounders=("torque_ripple", "cogging", "coulomb_position"),
     separate="one full turn both ways, at constant speed and with acceleration",
     beside=("stribeck", "presliding", "lugre"),
 )
@@ -300,7 +300,7 @@ LOAD_FRICTION = Effect(
     equation="F = -mu |u| sign(v)",
     parameters=(Parameter("mu", "1", Ref.ONE, 0.0, 0.6, 0.05, "share of the transmitted force lost"),),
     signature="force residual opposes motion and grows with the motor force",
-    lookalikes=("coulomb", "thermal_gain", "payload"),
+    confounders=("coulomb", "thermal_gain", "payload"),
     separate="the same speeds at several accelerations or loads",
 )
 

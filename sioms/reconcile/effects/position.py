@@ -42,7 +42,7 @@ OFFSET = Effect(
     equation="F = off",
     parameters=(Parameter("off", "{F}", Ref.FORCE, -1.0, 1.0, 0.02, "constant force on the axis"),),
     signature="force residual constant everywhere, at rest too",
-    lookalikes=("coulomb", "gravity", "viscous_direction"),
+    confounders=("coulomb", "gravity", "viscous_direction"),
     separate="motion both ways over one full turn, and rest",
 )
 GRAVITY = Effect(
@@ -57,7 +57,7 @@ GRAVITY = Effect(
         Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
     ),
     signature="force residual with one period in a turn, whatever the speed",
-    lookalikes=("offset", "cogging", "spring"),
+    confounders=("offset", "cogging", "spring"),
     separate="one full turn, slowly, both ways",
     linear=False,
 )
@@ -76,7 +76,7 @@ COGGING = Effect(
         Parameter("phase2", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "its phase", phase=True),
     ),
     signature="periodic force residual in position, present without current, whatever the speed",
-    lookalikes=("torque_ripple", "gravity", "eccentricity"),
+    confounders=("torque_ripple", "gravity", "eccentricity"),
     separate="one full turn slowly, with and without load",
 )
 SPRING = Effect(
@@ -88,7 +88,7 @@ SPRING = Effect(
     equation="F = -k x",
     parameters=(Parameter("k", "{F}/{x}", Ref.STIFFNESS, 0.0, 5.0, 0.02, "stiffness about position zero"),),
     signature="force residual proportional to position",
-    lookalikes=("gravity", "offset"),
+    confounders=("gravity", "offset"),
     separate="the whole range, slowly, both ways",
 )
 

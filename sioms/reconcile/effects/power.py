@@ -38,7 +38,7 @@ SLEW_LIMIT = Effect(
     equation="F follows u, |dF/dt| <= rate",
     parameters=(Parameter("rate", "{F}/s", Ref.RISE, 1.0, 5e4, 50.0, "largest rate of change of the force"),),
     signature="force residual after steps of the command, the longer the larger they are; measured current in ramps",
-    lookalikes=("lag", "delay", "saturation"),
+    confounders=("lag", "delay", "saturation"),
     separate="force steps of several heights: a lag takes as long for all, a limited rate longer for large ones",
 )
 SUPPLY_LIMIT = Effect(
@@ -58,7 +58,7 @@ SUPPLY_LIMIT = Effect(
         Parameter("v0", "{x}/s", Ref.SPEED, 0.1, 20.0, 1.2, "speed at which no force is left"),
     ),
     signature="force residual where the command is large in the direction of motion, more at speed",
-    lookalikes=("saturation", "viscous", "quadratic_drag", "thermal_gain"),
+    confounders=("saturation", "viscous", "quadratic_drag", "thermal_gain"),
     separate="force steps of growing height at rest and at speed",
     replaces=("saturation",),
 )

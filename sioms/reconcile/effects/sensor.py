@@ -68,7 +68,7 @@ ENCODER_SCALE = Effect(
         ),
     ),
     signature="index marks at a wrong spacing; force residual as from a wrong inertia",
-    lookalikes=("payload", "thermal_gain"),
+    confounders=("payload", "thermal_gain"),
     separate="index marks over the whole range, or a known mass",
 )
 ECCENTRICITY = Effect(
@@ -86,7 +86,7 @@ ECCENTRICITY = Effect(
         Parameter("phase", "rad", Ref.ANGLE, -np.pi, np.pi, 0.0, "phase at position zero", phase=True),
     ),
     signature="apparent speed ripple once a turn, with the square of speed in force",
-    lookalikes=("gravity", "torque_ripple", "cogging"),
+    confounders=("gravity", "torque_ripple", "cogging"),
     separate="full turns at several speeds",
 )
 INTERPOLATION_ERROR = Effect(
@@ -105,7 +105,7 @@ INTERPOLATION_ERROR = Effect(
         Parameter("n", "1/pitch", Ref.ONE, 16.0, 4096.0, 64.0, "signal periods in a pitch", fixed=True),
     ),
     signature="wave of the position in the position, of one size at all speeds; taken for noise of the sensor",
-    lookalikes=("cogging", "torque_ripple"),
+    confounders=("cogging", "torque_ripple"),
     separate="slow motion over some signal periods, and full turns at several speeds",
 )
 ENCODER_QUANTISATION = Effect(
@@ -117,7 +117,7 @@ ENCODER_QUANTISATION = Effect(
     equation="counts come in multiples of factor",
     parameters=(Parameter("factor", "1", Ref.ONE, 1.0, 4096.0, 1.0, "true over stated resolution", fixed=True),),
     signature="only multiples of a number in the counts",
-    lookalikes=("backlash",),
+    confounders=("backlash",),
     separate="slow motion in one direction",
 )
 

@@ -104,7 +104,7 @@ def _law(
         equation=equation,
         parameters=(*values, *laid),
         signature="",
-        lookalikes=(),
+        confounders=(),
         separate="",
         replaces=replaces,
         beside=beside,

@@ -35,7 +35,7 @@ HARDENING_SPRING = Effect(
         Parameter("k3", "{F}/{x}^3", Ref.STIFFNESS, -1e12, 1e12, 0.02, "cubic stiffness about position zero"),
     ),
     signature="force residual with the cube of position",
-    lookalikes=("spring", "gravity", "asymmetric_spring"),
+    confounders=("spring", "gravity", "asymmetric_spring"),
     separate="the whole range, slowly, both ways, and swings of several sizes",
     sized=False,
     by_reach=True,
@@ -49,7 +49,7 @@ ASYMMETRIC_SPRING = Effect(
     equation="F = -d |x|: the stiffness is k + d above position zero, k - d below",
     parameters=(Parameter("d", "{F}/{x}", Ref.STIFFNESS, -5.0, 5.0, 0.02, "half the difference of the stiffnesses"),),
     signature="force residual with the distance from position zero, the same on both sides",
-    lookalikes=("offset", "spring", "gravity", "hardening_spring"),
+    confounders=("offset", "spring", "gravity", "hardening_spring"),
     separate="the whole range, slowly, both ways",
 )
 

@@ -130,7 +130,7 @@ def _term(
     mechanism: Mechanism = NONE,
     trials: Trials | None = None,
     replaces: tuple[str, ...] = (),
-    lookalikes: tuple[str, ...] = (),
+    confounders: tuple[str, ...] = (),
 ) -> Effect:
     return Effect(
         name=TERM_PREFIX + name,
@@ -143,7 +143,7 @@ def _term(
         equation=equation,
         parameters=parameters,
         signature="",
-        lookalikes=lookalikes,
+        confounders=confounders,
         separate="",
         replaces=replaces,
     )
@@ -157,7 +157,7 @@ TERMS = (
         stop_above,
         _size("k", "{F}/{x}", Ref.STIFFNESS, "stiffness of the stop"),
         PLACE,
-        lookalikes=("spring",),
+        confounders=("spring",),
     ),
     _term(
         "stop_below",
@@ -165,14 +165,14 @@ TERMS = (
         stop_below,
         _size("k", "{F}/{x}", Ref.STIFFNESS, "stiffness of the stop"),
         PLACE,
-        lookalikes=("spring",),
+        confounders=("spring",),
     ),
     _term(
         "v3",
         "F = -c v^3",
         cubic_drag,
         _size("c", "{F} s^3/{x}^3", Ref.DRAG),
-        lookalikes=("viscous", "quadratic_drag"),
+        confounders=("viscous", "quadratic_drag"),
     ),
     _term(
         "falling_drag",
@@ -180,7 +180,7 @@ TERMS = (
         falling_drag,
         _size("c", "{F} s/{x}", Ref.DAMPING),
         SPEED,
-        lookalikes=("viscous",),
+        confounders=("viscous",),
     ),
     _term(
         "levelling_drag",
@@ -188,7 +188,7 @@ TERMS = (
         levelling_drag,
         _size("f", "{F}", Ref.FORCE),
         SPEED,
-        lookalikes=("coulomb", "viscous"),
+        confounders=("coulomb", "viscous"),
     ),
     _term("xv", "F = -c x v", place_drag, _size("c", "{F} s/{x}^2", Ref.DAMPING)),
     _term(
@@ -206,7 +206,7 @@ TERMS = (
         _size("amp", "{F}", Ref.FORCE),
         PHASE,
         Parameter("kappa", "1/pitch", Ref.ONE, 0.02, 3.0, 0.5, "periods in a pitch, any number"),
-        lookalikes=("gravity", "spring", "offset"),
+        confounders=("gravity", "spring", "offset"),
     ),
     _term(
         "place_friction",
@@ -222,7 +222,7 @@ TERMS = (
         dull_force,
         _size("f", "{F}", Ref.FORCE),
         Parameter("u0", "{F}", Ref.FORCE, 5e-3, 0.5, 0.05, "force of the bend", shape=True),
-        lookalikes=("load_friction", "payload"),
+        confounders=("load_friction", "payload"),
     ),
     _term(
         "hysteresis",
@@ -244,7 +244,7 @@ TERMS = (
         mechanism=BUILDING_UP,
         trials=Trials(lambda seen: ({"xs": xs} for xs in lengths(seen, 5e-3, 100.0))),
         replaces=("presliding", "lugre", "coulomb", "stribeck", "coulomb_position"),
-        lookalikes=("coulomb",),
+        confounders=("coulomb",),
     ),
     _term(
         "turn_inertia",

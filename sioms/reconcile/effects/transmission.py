@@ -68,7 +68,7 @@ ELASTIC = Effect(
         Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.05, "damping ratio"),
     ),
     signature="force residual concentrated around one frequency, whatever the position",
-    lookalikes=("delay", "lag", "backlash", "payload", "swinging_load"),
+    confounders=("delay", "lag", "backlash", "payload", "swinging_load"),
     separate="a multi-sine across the resonance at two amplitudes",
     replaces=("backlash", "swinging_load"),
 )
@@ -93,7 +93,7 @@ SWINGING_LOAD = Effect(
         Parameter("zeta", "1", Ref.ONE, 0.0, 0.3, 0.02, "damping ratio"),
     ),
     signature="force residual at one low frequency that goes on after the axis has stopped",
-    lookalikes=("elastic", "payload", "spring"),
+    confounders=("elastic", "payload", "spring"),
     separate="short moves, and rests of several periods after them",
     replaces=("elastic", "backlash"),
 )
@@ -125,7 +125,7 @@ BACKLASH = Effect(
         Parameter("zeta", "1", Ref.ONE, 0.0, 2.0, 0.05, "damping ratio of the contact", soft=True),
     ),
     signature="bursts of force residual after every reversal of force",
-    lookalikes=("stribeck", "presliding", "elastic"),
+    confounders=("stribeck", "presliding", "elastic"),
     separate="force reversals of several amplitudes about rest",
     replaces=("elastic", "swinging_load"),
 )
@@ -149,7 +149,7 @@ PAYLOAD = Effect(
         ),
     ),
     signature="force residual proportional to acceleration",
-    lookalikes=("encoder_scale", "thermal_gain", "elastic"),
+    confounders=("encoder_scale", "thermal_gain", "elastic"),
     separate="index marks, or a known added mass",
 )
 

@@ -1,1 +1,1 @@
-"""What axes and sensors are reconciled by: free numbers and fits, the search, look-alikes, what speaks for a name."""
+"""What axes and sensors are reconciled by: free numbers and fits, the search, confounders, what speaks for a name."""

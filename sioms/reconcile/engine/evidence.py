@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sioms.reconcile.effect import AnyEffect, Array
-from sioms.reconcile.ladder import Step
 from sioms.reconcile.rules import Rival, told_apart
+from sioms.reconcile.selection import Step
 from sioms.reconcile.thresholds import GAIN
 from sioms.reconcile.verdict import Estimate, NamedEffect, Outcome, Place
 
@@ -34,7 +34,7 @@ def described(
     saved: tuple[float, float, float],
     evidence: Iterable[str],
     others: Sequence[Rival[Any]],
-    ladder: Sequence[Step[Any]],
+    path: Sequence[Step[Any]],
     present: Iterable[str],
     numbers: Mapping[str, str],
     wider: Iterable[str] = (),
@@ -43,12 +43,12 @@ def described(
 
     Args:
         saved: what it saves beyond all others, in how many standard errors, and in what share of replicates.
-        others: look-alikes that were refitted.
+        others: confounders that were refitted.
         present: effects of the model.
-        numbers: with which numbers a look-alike stands in its place, for some.
+        numbers: with which numbers a confounder stands in its place, for some.
         wider: effects that contain this one.
     """
-    ruled, still = told_apart(effect.name, effect.lookalikes, others, ladder, set(present), set(wider))
+    ruled, still = told_apart(effect.name, effect.confounders, others, path, set(present), set(wider))
     still = {rival: text + (f", with {numbers[rival]}" if rival in numbers else "") for rival, text in still.items()}
     return NamedEffect(
         effect.name,

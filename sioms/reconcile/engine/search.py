@@ -1,7 +1,7 @@
 """Search for the effects that are missing: screen, refit the best few nested, let earlier ones leave again.
 
 A step adds the effect that saves most on held-out blocks, but the simplest one within a standard error of it. After
-each step every effect must still earn its place, and a simpler look-alike that does as well takes the place of a richer
+each step every effect must still earn its place, and a simpler confounder that does as well takes the place of a richer
 one. The search stops when nothing saves ``GAIN`` of what remains. What a subject fits, screens and calls possible it
 says in its own ``Searcher``.
 """
@@ -15,7 +15,7 @@ from typing import Any, ClassVar, Generic
 
 import numpy as np
 
-from sioms.reconcile import ladder
+from sioms.reconcile import selection
 from sioms.reconcile.blocks import better
 from sioms.reconcile.effect import Array
 from sioms.reconcile.engine.fit import Fit, M
@@ -70,7 +70,7 @@ class Tried(Generic[M]):
     saved: Saving
 
 
-Added = tuple[Fit[M], Array, ladder.Step[M]]
+Added = tuple[Fit[M], Array, selection.Step[M]]
 
 
 class Search(ABC, Generic[M]):
@@ -134,7 +134,7 @@ class Search(ABC, Generic[M]):
 
     @abstractmethod
     def simpler(self, fit: Fit[M], name: str) -> Iterable[tuple[str, str, Fit[M]]]:
-        """Yield what a simpler look-alike takes the place of, its name, and the fit with it there."""
+        """Yield what a simpler confounder takes the place of, its name, and the fit with it there."""
 
     def ratio(self, fit: Fit[M]) -> float:
         """Return the root mean square over all rows, in units of the floor."""
@@ -216,11 +216,11 @@ class Search(ABC, Generic[M]):
 
     # -- the search
 
-    def run(self, start: M) -> ladder.Found[Fit[M], M]:
+    def run(self, start: M) -> selection.Found[Fit[M], M]:
         """Search from a model."""
         fit = self.levelled(start)
         losses = self.loss(fit)
-        steps = [ladder.Step("start", "", self.ratio(fit), 0.0, fit.model)]
+        steps = [selection.Step("start", "", self.ratio(fit), 0.0, fit.model)]
         for _ in range(self.footing.steps):
             if self.done(fit):
                 break
@@ -233,7 +233,7 @@ class Search(ABC, Generic[M]):
             fit, losses = self._simplify(fit, losses, steps)
             fit, losses = self.eliminate(fit, losses, steps)
             fit, losses = self.settle_model(fit, losses)
-        return ladder.Found(fit, losses, tuple(steps))
+        return selection.Found(fit, losses, tuple(steps))
 
     def _add(self, fit: Fit[M], losses: Array) -> Added[M] | None:
         """Refit the best candidates and take the simplest of those that save most."""
@@ -251,7 +251,7 @@ class Search(ABC, Generic[M]):
         if saved.share < SPECIFIC and self.unspecific(name, tried, fit, losses):
             return None
         rivals = {n: t.saved.share for n, t in tried.items() if n != name}
-        return new, loss, ladder.Step("add", name, self.ratio(new), saved.share, new.model, rivals)
+        return new, loss, selection.Step("add", name, self.ratio(new), saved.share, new.model, rivals)
 
     def _add_pair(self, fit: Fit[M], losses: Array) -> Added[M] | None:
         """Add two effects at once where neither saves enough alone: each hides what the other would save.
@@ -289,7 +289,7 @@ class Search(ABC, Generic[M]):
         return (
             found.fit,
             found.losses,
-            ladder.Step("add", both, self.ratio(found.fit), found.saved.share, found.fit.model),
+            selection.Step("add", both, self.ratio(found.fit), found.saved.share, found.fit.model),
         )
 
     def simplest(self, good: Mapping[str, Tried[M]]) -> str:
@@ -303,7 +303,7 @@ class Search(ABC, Generic[M]):
         about = [n for n, t in good.items() if t is best or near(t)]
         return about[0] if len(about) == 1 else min(about, key=lambda n: self.order(n, good[n], best.fit))
 
-    def eliminate(self, fit: Fit[M], losses: Array, steps: list[ladder.Step[M]]) -> tuple[Fit[M], Array]:
+    def eliminate(self, fit: Fit[M], losses: Array, steps: list[selection.Step[M]]) -> tuple[Fit[M], Array]:
         """Let effects leave that no longer save their share; the last stays."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             if len(set(fit.model.effects) - set(self.frozen)) < 2:
@@ -316,11 +316,11 @@ class Search(ABC, Generic[M]):
             spared = negligible(gap.share, gap.errors) and self.may_leave(without, fit)
             if spared or self.vanished(fit, name):
                 fit, losses = without, loss
-                steps.append(ladder.Step("leave", name, self.ratio(fit), -gap.share, fit.model))
+                steps.append(selection.Step("leave", name, self.ratio(fit), -gap.share, fit.model))
         return fit, losses
 
-    def _simplify(self, fit: Fit[M], losses: Array, steps: list[ladder.Step[M]]) -> tuple[Fit[M], Array]:
-        """Put a simpler look-alike in the place of a richer effect where it does as well."""
+    def _simplify(self, fit: Fit[M], losses: Array, steps: list[selection.Step[M]]) -> tuple[Fit[M], Array]:
+        """Put a simpler confounder in the place of a richer effect where it does as well."""
         for name in [n for n in fit.model.effects if n not in self.frozen]:
             for gone, other, new in self.simpler(fit, name):
                 loss = self.loss(new)
@@ -328,10 +328,10 @@ class Search(ABC, Generic[M]):
                 if negligible(gap.share, gap.errors) and self.may_stand(new, other):
                     fit, losses = new, loss
                     said = f"{gone} to {other}"
-                    steps.append(ladder.Step("simplify", said, self.ratio(fit), -gap.share, fit.model))
+                    steps.append(selection.Step("simplify", said, self.ratio(fit), -gap.share, fit.model))
                     break
         return fit, losses
 
     def may_stand(self, new: Fit[M], name: str) -> bool:
-        """Say whether a look-alike can be in the place that it was given."""
+        """Say whether a confounder can be in the place that it was given."""
         return True

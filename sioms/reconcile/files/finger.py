@@ -67,7 +67,7 @@ def reconcile_tactile(
         model: nominal finger (TOML or JSON); None takes ``nominal.json`` in the folder.
         seed: of permutations and bootstrap, 0 or more.
         progress: told what is being done.
-        bench: what touches can be made to decide between look-alikes.
+        bench: what touches can be made to decide between confounders.
 
     Returns:
         The verdict; lengths in m, angles in rad, loads in N/m, outputs as fractions.

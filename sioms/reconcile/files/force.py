@@ -70,7 +70,7 @@ def reconcile_force(
         columns: column description; None takes ``columns.toml`` beside the data.
         seed: of permutations and bootstrap, 0 or more.
         progress: told what is being done.
-        plans: programmes of loads that can be applied to decide between look-alikes.
+        plans: programmes of loads that can be applied to decide between confounders.
 
     Returns:
         The verdict; loads and readings as shares of each component's full range.

@@ -103,7 +103,7 @@ GAIN = SensorEffect(
     equation="gain_i = stated gain_i (1 + g_i)",
     parameters=(Quantity("g", "1", -0.9, 9.0, 0.1, "relative departure of each element's gain", each=True),),
     signature="output too large or too small in one proportion wherever and however it is touched, element by element",
-    lookalikes=("depth_scatter", "poisson", "strip_inhomogeneity", "soft_skin"),
+    confounders=("depth_scatter", "poisson", "strip_inhomogeneity", "soft_skin"),
     separate="edge touches every degree across each element: depth changes the width of the profile, gain does not",
     twins=("depth_scatter", "strip_inhomogeneity"),
 )
@@ -115,7 +115,7 @@ ANGLE = SensorEffect(
     equation="t_i = stated t_i + dt_i",
     parameters=(Quantity("dt", "rad", -0.14, 0.14, 0.01, "departure of each element's angle", each=True),),
     signature="residual like the slope of the profile, of its own size and sign for each element",
-    lookalikes=("angle_offset", "sliding_friction", "gain_scatter", "depth_scatter"),
+    confounders=("angle_offset", "sliding_friction", "gain_scatter", "depth_scatter"),
     separate="edge touches every degree across each element",
 )
 DEPTH = SensorEffect(
@@ -126,7 +126,7 @@ DEPTH = SensorEffect(
     equation="rs_i = stated rs_i + dr_i",
     parameters=(Quantity("dr", "m", -1.2e-3, 1.2e-3, 2e-4, "departure of each element's radius", each=True),),
     signature="profile higher and narrower, or lower and wider, element by element",
-    lookalikes=("gain_scatter", "poisson"),
+    confounders=("gain_scatter", "poisson"),
     separate="edge touches every degree across each element: the width of the profile tells the depth",
     twins=("gain_scatter",),
 )
@@ -138,7 +138,7 @@ OFFSET = SensorEffect(
     equation="place of touch = commanded place + off",
     parameters=(Quantity("off", "rad", -0.2, 0.2, 0.01, "how much further round every touch is"),),
     signature="residual like the slope of the profile, alike for all elements",
-    lookalikes=("angle_scatter", "sliding_friction"),
+    confounders=("angle_scatter", "sliding_friction"),
     separate="the same touches while the indenter drags the other way",
     session=("off",),
 )
@@ -150,7 +150,7 @@ POISSON = SensorEffect(
     equation="nu = stated nu + dnu",
     parameters=(Quantity("dnu", "1", -0.16, 0.04, 0.02, "departure of Poisson's ratio"),),
     signature="under the touch and beside it in another proportion, alike for all elements",
-    lookalikes=("adhesion", "hertz", "gain_scatter", "depth_scatter"),
+    confounders=("adhesion", "hertz", "gain_scatter", "depth_scatter"),
     separate="the same places with an edge and with a flat: adhesion needs a wide contact, Poisson's ratio does not",
 )
 CORE = SensorEffect(
@@ -161,7 +161,7 @@ CORE = SensorEffect(
     equation="ra = stated ra + dc",
     parameters=(Quantity("dc", "m", -6e-4, 6e-4, 1e-4, "departure of the core's radius"),),
     signature="profile wider and larger, or narrower and smaller, alike for all elements",
-    lookalikes=("poisson", "depth_scatter", "soft_skin", "strip_peak", "cross_talk"),
+    confounders=("poisson", "depth_scatter", "soft_skin", "strip_peak", "cross_talk"),
     separate="the same places with an edge and with a flat, over a decade of loads",
     twins=("depth_scatter",),
 )
@@ -175,7 +175,7 @@ QUADRATIC = SensorEffect(
         Quantity("q", "1", -20.0, 20.0, 2.0, "quadratic coefficient of each element, per unit of output", each=True),
     ),
     signature="residual with the square of the output",
-    lookalikes=("hertz", "gain_scatter", "creep"),
+    confounders=("hertz", "gain_scatter", "creep"),
     separate="a decade of loads at one place with an edge and with a flat",
     twins=("hertz",),
 )
@@ -187,7 +187,7 @@ TEMPERATURE = SensorEffect(
     equation="d = d + k (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of the output"),),
     signature="untouched outputs move together with the temperature",
-    lookalikes=("creep", "temperature_scatter"),
+    confounders=("creep", "temperature_scatter"),
     separate="a temperature step of 2 K at zero load",
     session=("T0",),
 )
@@ -199,7 +199,7 @@ TEMPERATURE_EACH = SensorEffect(
     equation="d_i = d_i + k_i (T - T0)",
     parameters=(Quantity("k", "1/K", -0.5, 0.5, 2e-3, "drift of each element's output", each=True),),
     signature="untouched outputs move with the temperature, each in its own proportion",
-    lookalikes=("creep", "temperature_drift"),
+    confounders=("creep", "temperature_drift"),
     separate="a temperature step of 2 K at zero load",
     session=("T0",),
     replaces=("temperature_drift",),
@@ -215,7 +215,7 @@ CREEP = SensorEffect(
         Quantity("tau", "s", 0.02, 300.0, 0.3, "time constant", starts=(0.1, 0.4, 1.0, 3.0, 12.0)),
     ),
     signature="outputs go on rising (or fall) in one proportion while the load stays",
-    lookalikes=("temperature_drift", "gain_scatter", "quadratic"),
+    confounders=("temperature_drift", "gain_scatter", "quadratic"),
     separate="one touch held for 30 s at constant temperature, and a temperature step at zero load",
     twins=("gain_scatter",),
 )
@@ -230,7 +230,7 @@ PROXIMITY = SensorEffect(
         Quantity("range", "rad", 0.03, 2.0, 0.05, "angle over which it falls to 1/e", starts=(0.12, 0.25, 0.6)),
     ),
     signature="output lowered wherever the indenter is near, whatever the load",
-    lookalikes=("adhesion", "poisson"),
+    confounders=("adhesion", "poisson"),
     separate="bring a grounded and an insulating indenter near before the touch",
 )
 STRIP = SensorEffect(
@@ -255,7 +255,7 @@ STRIP = SensorEffect(
         Quantity("turn", "rad", -np.pi, np.pi, 0.3, "its phase at angle zero", phase=True),
     ),
     signature="all elements too loud and too quiet together, periodic in the place of touch",
-    lookalikes=("gain_scatter",),
+    confounders=("gain_scatter",),
     separate="touches in steps of less than half a period over several periods",
     twins=("gain_scatter",),
 )
@@ -270,7 +270,7 @@ PEAK = SensorEffect(
         Quantity("width", "rad", 0.02, 0.5, 0.03, "angle over which that falls to 1/e", starts=(0.04, 0.07, 0.12, 0.2)),
     ),
     signature="profile too high in its middle in one proportion at all loads, alike for all elements",
-    lookalikes=("depth_scatter", "poisson", "quadratic", "cross_talk", "gain_scatter", "proximity", "hertz"),
+    confounders=("depth_scatter", "poisson", "quadratic", "cross_talk", "gain_scatter", "proximity", "hertz"),
     separate="edge touches every degree across each element, at a decade of loads",
 )
 ADHESION = SensorEffect(
@@ -281,7 +281,7 @@ ADHESION = SensorEffect(
     equation="q = share * (tangential traction of full adhesion)",
     parameters=(Quantity("share", "1", 0.0, 1.4, 0.4, "share of full adhesion (edge resolved to a/256)"),),
     signature="profile narrower the wider the contact, alike for all elements",
-    lookalikes=("poisson", "hertz", "proximity"),
+    confounders=("poisson", "hertz", "proximity"),
     separate="the same places with an edge and with a flat: adhesion needs a wide contact, Poisson's ratio does not",
 )
 SOFT = SensorEffect(
@@ -292,7 +292,7 @@ SOFT = SensorEffect(
     equation="u(P) = stated u(P (1 + s)): strains go with the load over shear modulus and length of contact",
     parameters=(Quantity("s", "1", -0.8, 4.0, 0.05, "stated over true stiffness and length of contact, less one"),),
     signature="all outputs too large in one proportion, and contacts as wide as under larger loads",
-    lookalikes=("gain_scatter", "force_gain", "poisson", "creep", "hertz", "strip_peak"),
+    confounders=("gain_scatter", "force_gain", "poisson", "creep", "hertz", "strip_peak"),
     separate="a decade of loads at one place with an edge and with a flat; a known weight on the load cell",
     twins=("gain_scatter",),
 )
@@ -304,7 +304,7 @@ HERTZ = SensorEffect(
     equation="p = (1 - share) p(rigid core) + share p(Hertz)",
     parameters=(Quantity("share", "1", -0.5, 1.5, 0.4, "1 is Hertz's half plane, 0 the rigid core"),),
     signature="profile under wide indenters too wide, more at higher loads",
-    lookalikes=("adhesion", "poisson", "quadratic"),
+    confounders=("adhesion", "poisson", "quadratic"),
     separate="flats over a decade of loads",
 )
 SLIDING = SensorEffect(
@@ -318,7 +318,7 @@ SLIDING = SensorEffect(
         Quantity("apex", "1", 0.0, 1.0, 0.3, "0: places are middles of contact, 1: apexes"),
     ),
     signature="profile lopsided, the same way for all elements",
-    lookalikes=("angle_offset", "angle_scatter"),
+    confounders=("angle_offset", "angle_scatter"),
     separate="the same touches while the indenter drags the other way",
     session=("apex",),
 )
@@ -330,7 +330,7 @@ CROSSTALK = SensorEffect(
     equation="d_i = d_i + x (d_(i-1) + d_(i+1))",
     parameters=(Quantity("x", "1", -0.4, 0.4, 0.02, "share of each neighbour"),),
     signature="a second profile one pitch away",
-    lookalikes=("depth_scatter", "poisson"),
+    confounders=("depth_scatter", "poisson"),
     separate="a calibration voltage on one element at a time",
 )
 CELL = SensorEffect(
@@ -341,7 +341,7 @@ CELL = SensorEffect(
     equation="reading = P (1 + g)",
     parameters=(Quantity("g", "1", -0.8, 4.0, 0.02, "relative error of the load cell"),),
     signature="the load cell off in one proportion while the outputs agree with the commanded load",
-    lookalikes=("gain_scatter",),
+    confounders=("gain_scatter",),
     separate="hang a known weight on the load cell",
 )
 MAINS = SensorEffect(
@@ -355,7 +355,7 @@ MAINS = SensorEffect(
         Quantity("f", "Hz", 0.0, 1e6, 1.0, "frequency"),
     ),
     signature="a line in the spectrum of untouched frames",
-    lookalikes=(),
+    confounders=(),
     rankable=False,
     separate="untouched frames at full rate for 30 s",
 )
@@ -367,7 +367,7 @@ DEAD = SensorEffect(
     equation="d_i = const",
     parameters=(Quantity("index", "1", 0.0, 1e4, 1.0, "its number, from 0"),),
     signature="a reading that neither noise nor touch moves",
-    lookalikes=("gain_scatter",),
+    confounders=("gain_scatter",),
     rankable=False,
     separate="touch it",
 )

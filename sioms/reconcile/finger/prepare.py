@@ -66,7 +66,7 @@ def prepare(
         nominal: the finger as the simulation has it.
         scale: output per raw unit.
         refine_extent: the elements' width is not known and fitted along.
-        bench: what touches can be made to decide between look-alikes.
+        bench: what touches can be made to decide between confounders.
 
     Raises:
         BadInputError: the recordings cannot be used; the message says why.

@@ -78,7 +78,7 @@ TERMS = (
         "d = l + k l^3",
         cubed,
         Quantity("k", "1", -500.0, 500.0, 20.0, "size"),
-        lookalikes=("quadratic",),
+        confounders=("quadratic",),
     ),
     term(
         "knee",
@@ -86,7 +86,7 @@ TERMS = (
         bent,
         Quantity("c", "1", -1.2, 1.2, 0.02, "slope that is lost there"),
         Quantity("s", "1", 1e-3, 1.0, 5e-3, "output", starts=(0.01, 0.02, 0.04, 0.07, 0.12, 0.2)),
-        lookalikes=("quadratic",),
+        confounders=("quadratic",),
     ),
     term(
         "time",
@@ -94,7 +94,7 @@ TERMS = (
         fading,
         Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "in the middle of the time"),
-        lookalikes=("gain_scatter",),
+        confounders=("gain_scatter",),
     ),
     term(
         "warmth",
@@ -102,7 +102,7 @@ TERMS = (
         warming,
         Quantity("k", "1/K", -1.0, 1.0, 0.01, "size"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "at the mean temperature"),
-        lookalikes=("gain_scatter",),
+        confounders=("gain_scatter",),
     ),
     term(
         "place",
@@ -110,14 +110,14 @@ TERMS = (
         rising,
         Quantity("k", "1/rad", -1.0, 1.0, 0.02, "size"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "at the mean place"),
-        lookalikes=("gain_scatter",),
+        confounders=("gain_scatter",),
     ),
     term(
         "offset",
         "d = l + k under any touch",
         lifted,
         Quantity("k", "1", -0.3, 0.3, 1e-3, "size"),
-        lookalikes=("proximity",),
+        confounders=("proximity",),
     ),
     term(
         "load",
@@ -125,7 +125,7 @@ TERMS = (
         stiffening,
         Quantity("k", "1", -1.0, 1.0, 0.02, "exponent"),
         Quantity("c", "1", -0.5, 0.5, 0.02, "at 200 N/m"),
-        lookalikes=("quadratic", "hertz", "gain_scatter"),
+        confounders=("quadratic", "hertz", "gain_scatter"),
     ),
     term(
         "lopsided",
@@ -133,7 +133,7 @@ TERMS = (
         lopsided,
         Quantity("k", "1", -0.3, 0.3, 2e-3, "size"),
         Quantity("w", "rad", 0.02, 1.0, 0.05, "reach", starts=(0.05, 0.15, 0.4)),
-        lookalikes=("sliding_friction", "angle_offset"),
+        confounders=("sliding_friction", "angle_offset"),
     ),
     term(
         "ripple",

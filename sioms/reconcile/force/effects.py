@@ -59,7 +59,7 @@ GAIN = SensorEffect(
     equation="reading_i = (1 + g_i) (stated reading_i)",
     parameters=(Quantity("g", "1", -0.9, 9.0, 0.02, "relative departure of each component's gain", each=True),),
     signature="reading off in proportion to its own load",
-    lookalikes=("cross_talk", "quadratic", "hysteresis"),
+    confounders=("cross_talk", "quadratic", "hysteresis"),
     separate="load each component alone, in both directions",
     twins=("cross_talk",),
 )
@@ -71,7 +71,7 @@ QUADRATIC = SensorEffect(
     equation="reading_i = l_i + q_i l_i^2",
     parameters=(Quantity("q", "1", -1.0, 1.0, 0.01, "at full range, of each component", each=True),),
     signature="off alike for both signs of the load, with its square",
-    lookalikes=("gain", "hysteresis"),
+    confounders=("gain", "hysteresis"),
     separate="each component alone in five steps or more, in both directions",
 )
 DRIFT = SensorEffect(
@@ -82,7 +82,7 @@ DRIFT = SensorEffect(
     equation="reading_i = l_i + d_i t",
     parameters=(Quantity("d", "1/s", -1.0, 1.0, 1e-5, "of each component", each=True),),
     signature="off in proportion to time, whatever the load",
-    lookalikes=("temperature",),
+    confounders=("temperature",),
     separate="ten minutes at zero load at constant temperature, then a temperature step",
     session=("d",),
 )
@@ -94,7 +94,7 @@ TEMPERATURE = SensorEffect(
     equation="reading_i = l_i + k_i (T - T0)",
     parameters=(Quantity("k", "1/K", -1.0, 1.0, 1e-3, "of each component", each=True),),
     signature="off with the temperature, whatever the load",
-    lookalikes=("offset_drift", "temperature_gain"),
+    confounders=("offset_drift", "temperature_gain"),
     separate="ten minutes at zero load at constant temperature, then a temperature step",
     session=("T0",),
 )
@@ -106,7 +106,7 @@ TEMPERATURE_GAIN = SensorEffect(
     equation="reading = l (1 + k (T - T0))",
     parameters=(Quantity("k", "1/K", -0.2, 0.2, 2e-3, "relative, alike for all components"),),
     signature="off with load times temperature",
-    lookalikes=("temperature", "gain"),
+    confounders=("temperature", "gain"),
     separate="the same loads cold and warm",
 )
 HYSTERESIS = SensorEffect(
@@ -134,7 +134,7 @@ HYSTERESIS = SensorEffect(
         Quantity("m", "1", 0.0, 1.0, 0.2, "share that forgets where the load turned round"),
     ),
     signature="off one way while the load rises and the other way while it falls",
-    lookalikes=("quadratic", "gain"),
+    confounders=("quadratic", "gain"),
     separate="each component alone up and down in steps, in both directions",
 )
 
@@ -158,7 +158,7 @@ def _cross(names: tuple[str, ...]) -> SensorEffect:
             for n in names
         ),
         signature="off in proportion to the load of another component",
-        lookalikes=("gain",),
+        confounders=("gain",),
         separate="load each component alone, in both directions",
         twins=("gain",),
     )
@@ -221,7 +221,7 @@ TERMS = (
         following,
         Quantity("c", "1", -1.2, 1.2, 0.01, "what comes late, of each component", each=True),
         Quantity("tau", "s", 1e-3, 1e5, 1.0, "time constant", starts=(2.0, 0.02, 0.1, 0.5, 10.0, 60.0)),
-        lookalikes=("hysteresis", "term_creep"),
+        confounders=("hysteresis", "term_creep"),
     ),
     term(
         "creep",
@@ -229,7 +229,7 @@ TERMS = (
         creeping,
         Quantity("c", "1", -1.2, 1.2, 0.01, "what is added in time, of each component", each=True),
         Quantity("tau", "s", 1e-3, 1e5, 1.0, "time constant", starts=(2.0, 0.02, 0.1, 0.5, 10.0, 60.0)),
-        lookalikes=("hysteresis", "gain", "term_late"),
+        confounders=("hysteresis", "gain", "term_late"),
     ),
     term(
         "knee",
@@ -237,7 +237,7 @@ TERMS = (
         bent,
         Quantity("c", "1", -1.2, 1.2, 0.02, "slope that is lost there, of each component", each=True),
         Quantity("s", "1", 0.2, 1.0, 0.02, "of full range", each=True, starts=(0.3, 0.45, 0.6, 0.75, 0.9)),
-        lookalikes=("gain", "quadratic", "term_dull"),
+        confounders=("gain", "quadratic", "term_dull"),
     ),
     term(
         "dull",
@@ -245,7 +245,7 @@ TERMS = (
         dulled,
         Quantity("c", "1", -1.2, 1.2, 0.02, "slope that is lost there, of each component", each=True),
         Quantity("s", "1", 1e-3, 0.3, 5e-3, "of full range", each=True, starts=(0.01, 0.03, 0.1)),
-        lookalikes=("gain", "hysteresis", "term_knee"),
+        confounders=("gain", "hysteresis", "term_knee"),
     ),
     term(
         "swelling",
@@ -254,21 +254,21 @@ TERMS = (
         Quantity("k", "1", -1.0, 1.0, 0.01, "size, of each component", each=True),
         Quantity("m", "1", -1.0, 1.0, 0.02, "load", starts=(0.3, -0.9, -0.6, -0.3, 0.0, 0.6, 0.9)),
         Quantity("w", "1", 0.03, 1.0, 0.05, "width", starts=(0.1, 0.25)),
-        lookalikes=("gain", "quadratic"),
+        confounders=("gain", "quadratic"),
     ),
     term(
         "cube",
         "reading_i = l_i + k_i l_i^3",
         cubed,
         Quantity("k", "1", -2.0, 2.0, 0.01, "at full range", each=True),
-        lookalikes=("gain", "quadratic"),
+        confounders=("gain", "quadratic"),
     ),
     term(
         "time",
         "reading = l (1 + k t)",
         fading,
         Quantity("k", "1/s", -0.1, 0.1, 1e-5, "size"),
-        lookalikes=("gain", "temperature_gain"),
+        confounders=("gain", "temperature_gain"),
     ),
     term(
         "settling",
@@ -276,7 +276,7 @@ TERMS = (
         settling,
         Quantity("d", "1", -1.0, 1.0, 0.01, "at last", each=True),
         Quantity("tau", "s", 0.1, 1e5, 20.0, "time constant", starts=(5.0, 20.0, 60.0, 200.0)),
-        lookalikes=("offset_drift",),
+        confounders=("offset_drift",),
     ),
     term(
         "coupled",

@@ -210,7 +210,7 @@ def prepare(records: ForceRecords, model: SensorModel, plans: Sequence[Plan] = (
     """Check the recordings and lay them out.
 
     Args:
-        plans: programmes of loads that can be applied to decide between look-alikes; none for those of the catalogue.
+        plans: programmes of loads that can be applied to decide between confounders; none for those of the catalogue.
 
     Raises:
         BadInputError: they cannot be used; the message says why.

@@ -29,7 +29,7 @@ SCALES = tuple(
 SCALED = frozenset().union(*(names for pair in SCALES for names in pair))
 PATIENCE = 30  # steps of a fit
 CERTAIN = 4.5
-"""Logarithm of the likelihood by which a look-alike must be worse: three standard deviations. A grasp counts once, for
+"""Logarithm of the likelihood by which a confounder must be worse: three standard deviations. A grasp counts once, for
 its rows under several loads have their errors in common."""
 POSSIBLE = 0.5  # times its natural size that an effect may have before it is said that it is not excluded
 UNTOLD = 1e-6  # times its noise by which a row must change to tell of an effect
@@ -67,7 +67,7 @@ def unsure(
 ) -> SensorVerdict:
     """List effects that could be in the place of a named one, and call the verdict ambiguous.
 
-    By its share a look-alike is ruled out where it misses a few per cent of what an effect explains. Of thousands of
+    By its share a confounder is ruled out where it misses a few per cent of what an effect explains. Of thousands of
     samples that is sure; of a dozen grasps, in which a turned finger 1 and a turned finger 2 leave nearly the same, it
     is a hundredth of their scatter.
 
@@ -106,7 +106,7 @@ def overlooked(
 
     The search counts by the stated noise where rows are too few to tell their scatter. Where they scatter a third of
     it, as a dozen grasps of a quiet hand do, an effect well above what they scatter is below its floor. Here it counts
-    by the likelihood with each view's own scatter, as look-alikes do, and by an interval that does not hold zero.
+    by the likelihood with each view's own scatter, as confounders do, and by an interval that does not hold zero.
 
     Args:
         v: the verdict; data: all rows; scatter: by how many times its stated noise each view is taken to scatter.

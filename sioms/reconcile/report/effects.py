@@ -84,8 +84,8 @@ def section(
         bounds = "any" if p.phase else f"{p.lower:g} to {p.upper:g}"
         lines.append(f"| {symbol} | {p.unit} | {bounds} | {size} | {p.text} |")
     lines += ["", picture, "", f"Where its residual is: {effect.signature}.{where}"]
-    if effect.lookalikes:
-        lines.append(f"Confused with: {', '.join(effect.lookalikes)}. Told apart by: {effect.separate}.")
+    if effect.confounders:
+        lines.append(f"Confused with: {', '.join(effect.confounders)}. Told apart by: {effect.separate}.")
     lines += more
     if effect.session:
         lines.append(f"Belongs to the session: {', '.join(effect.session)}.")

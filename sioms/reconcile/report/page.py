@@ -108,7 +108,7 @@ def page(v: Verdict, seconds: float, *, draw: bool = True) -> Page:
     p.text(_where(v))
     show("places", "spectra")
     p.head("How it was found")
-    _ladder(p, v)
+    _selection_path(p, v)
     if isinstance(v, AxisVerdict) and v.states:
         _session(p, v)
     _alike(p, v)
@@ -282,12 +282,12 @@ def _alike(p: Page, v: Verdict) -> None:
         p.table(("effect", "effect", "in common"), rows, folded="effects that would show alike in these records")
 
 
-def _ladder(p: Page, v: Verdict) -> None:
+def _selection_path(p: Page, v: Verdict) -> None:
     head, rows = ["step", "effect", "residual / expected noise"], []
     if isinstance(v, AxisVerdict):
         head.append(f"force error, held out, {v.nominal.force_unit}")
         rows += [["channel", f.effect, "", "", f.evidence] for f in v.findings]
-    for i, s in enumerate(v.ladder):
+    for i, s in enumerate(v.path):
         names = " to ".join(f"{t} ({n})" if (t := v.title(n)) else n for n in s.effect.split(" to "))
         error = [Cell(number(v.rungs[i]))] if isinstance(v, AxisVerdict) else []
         rows.append([s.action, names, Cell(f"{s.ratio:.2f}"), *error, _rivals(s.rivals)])

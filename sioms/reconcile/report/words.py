@@ -212,7 +212,7 @@ def as_json(v: Verdict, seconds: float) -> str:
         "gaps": [_gap(g, isinstance(v, AxisVerdict)) for g in v.gaps],
         "ladder": [
             {"action": s.action, "effect": s.effect, "ratio": s.ratio, "saved": s.saved, "rivals": s.rivals}
-            for s in v.ladder
+            for s in v.path
         ],
         "not_excited": v.missing,
         "same_in_these_records": [list(p) for p in v.pairs],
@@ -265,7 +265,7 @@ def _more(v: Verdict) -> dict[str, Any]:
                 "rivals": s.rivals,
                 "untouched_force_error": e,
             }
-            for s, e in zip(v.ladder, v.rungs, strict=True)
+            for s, e in zip(v.path, v.rungs, strict=True)
         ],
         "alternative_parameters": [{name: dict(values) for name, values in m.items()} for m in v.others],
         "residual_over_floor": v.ratio,

@@ -1,4 +1,4 @@
-"""Look-alikes in the place of each named effect of a sensor: is it the one, and what else could it be?"""
+"""Confounders in the place of each named effect of a sensor: is it the one, and what else could it be?"""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from sioms.reconcile.thresholds import ALIKE, AMBIGUOUS, FELT
 
 Rival = rules.Rival[Fit]
 
-PATIENCE = 30  # steps of a look-alike's fit: one that stopped short would be ruled out
+PATIENCE = 30  # steps of a confounder's fit: one that stopped short would be ruled out
 ELSEWHERE = (-3.0, -1.0, 1.0, 3.0)  # natural sizes at which numbers of the elements' own begin again
 
 
@@ -40,7 +40,7 @@ def settle(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, flo
 
 
 def rivals(searcher: Searcher, found: Found, pairs: Sequence[tuple[str, str, float]] = ()) -> list[Rival]:
-    """Refit with each look-alike in the place of each named effect, also with those too weak by nature to be searched.
+    """Refit with each confounder in the place of each named effect, also with those too weak by nature to be searched.
 
     Args:
         pairs: effects that leave the same trace, with the share in common, as the gate found them.

@@ -56,7 +56,7 @@ def analyse(subject: Subject, options: Options | None = None) -> SensorVerdict:
         subject, found = _search(subject, searcher, subject.model)
         found, names = _without_stand_ins(subject, searcher, found, names)
         searcher.names = names
-    o.progress("identifiability: look-alikes in the place of each effect")
+    o.progress("identifiability: confounders in the place of each effect")
     found, others = settle(searcher, found, pairs)
     missing = {n: text for n, text in missing.items() if n not in found.fit.model.effects}
     share, where = _smoothed(subject, searcher, found)
@@ -79,7 +79,7 @@ def _search(subject: Subject, searcher: Searcher, start: SensorModel) -> tuple[S
         return subject, found
     searcher.data = sharper.training
     further = searcher.run(found.fit.model)
-    return sharper, replace(further, ladder=(*found.ladder, *further.ladder[1:]))
+    return sharper, replace(further, path=(*found.path, *further.path[1:]))
 
 
 def _smoothed(subject: Subject, searcher: Searcher, found: Found) -> tuple[float, str]:
@@ -161,7 +161,7 @@ def _conclude(
 ) -> SensorVerdict:
     rng = np.random.default_rng(o.seed)
     o.progress("untouched rows: gap before and after")
-    start = found.ladder[0].model
+    start = found.path[0].model
     gaps = _gaps(subject, start, found.fit.model)
     weights = on_one_footing(subject.whole, found.fit.model)
     fit = refit(subject.whole, found.fit.model, weights, searcher.frozen)
@@ -199,7 +199,7 @@ def _conclude(
         alternatives=alternatives,
         symbolic=tuple(terms),
         gaps=gaps,
-        ladder=found.ladder,
+        path=found.path,
         floors=floors,
         missing=missing,
         pairs=pairs,
@@ -256,7 +256,7 @@ def _describe(
             f"large ({gap.errors:.1f} standard errors, on blocks held out)"
         ]
         worth = gap.share, gap.errors, often
-        told = described(effect, estimates, worth, evidence, others, found.ladder, fit.model.effects, {})
+        told = described(effect, estimates, worth, evidence, others, found.path, fit.model.effects, {})
         out.append((bare.cost - found.fit.cost, told))
     out.sort(key=lambda e: -e[0])
     return apart(e for _, e in out)

@@ -49,7 +49,7 @@ class SensorEffect(AnyEffect):
 
     Attributes:
         change: (belief, values) -> belief.
-        twins: look-alikes that are put to the test however many parameters they have.
+        twins: confounders that are put to the test however many parameters they have.
     """
 
     parameters: tuple[Quantity, ...]
@@ -144,7 +144,7 @@ def term(
     equation: str,
     response: Callable[..., Array],
     *parameters: Quantity,
-    lookalikes: tuple[str, ...] = (),
+    confounders: tuple[str, ...] = (),
 ) -> SensorEffect:
     """Return a nameless term: what a refusal may offer where no effect of the library explains the data.
 
@@ -158,6 +158,6 @@ def term(
         change=responding(response, *(q.symbol for q in parameters)),
         parameters=parameters,
         signature="",
-        lookalikes=lookalikes,
+        confounders=confounders,
         separate="",
     )

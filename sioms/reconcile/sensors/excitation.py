@@ -28,7 +28,9 @@ def gate(subject: Subject) -> tuple[dict[str, str], tuple[tuple[str, str, float]
     for i, a in enumerate(shown):
         for b in shown[i + 1 :]:
             own, other = model.library[a], model.library[b]
-            alike = (b in own.lookalikes or a in other.lookalikes) and b not in own.replaces and a not in other.replaces
+            alike = (
+                (b in own.confounders or a in other.confounders) and b not in own.replaces and a not in other.replaces
+            )
             if alike and columns[a].shape[1] == columns[b].shape[1]:
                 each = own.primary.each and other.primary.each
                 same = _common(data, columns[a], columns[b], model.count if each else 0)

@@ -17,16 +17,16 @@ def termed(model: SensorModel) -> bool:
 
 
 def alike(lib: Mapping[str, SensorEffect], name: str, count: int) -> list[str]:
-    """Look-alikes in either direction that are not much richer, and the twins whatever their size."""
+    """Confounders in either direction that are not much richer, and the twins whatever their size."""
     own = lib[name]
-    both = [n for n in lib if n in own.lookalikes or name in lib[n].lookalikes]
+    both = [n for n in lib if n in own.confounders or name in lib[n].confounders]
     return [n for n in both if n not in own.replaces and (lib[n].size(count) <= own.size(count) + 1 or n in own.twins)]
 
 
 def family(model: SensorModel, name: str) -> set[str]:
-    """An effect, its look-alikes in either direction and what it replaces."""
+    """An effect, its confounders in either direction and what it replaces."""
     lib = model.library
-    return {name, *lib[name].lookalikes, *lib[name].replaces, *(n for n in lib if name in lib[n].lookalikes)}
+    return {name, *lib[name].confounders, *lib[name].replaces, *(n for n in lib if name in lib[n].confounders)}
 
 
 def without(model: SensorModel, names: tuple[str, ...]) -> SensorModel:

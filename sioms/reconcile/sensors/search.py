@@ -13,7 +13,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from sioms.reconcile import ladder
+from sioms.reconcile import selection
 from sioms.reconcile.blocks import better, heldout
 from sioms.reconcile.effect import TERM_PREFIX
 from sioms.reconcile.engine.search import AND, Added, Saving, Search, Start, Tried
@@ -23,8 +23,8 @@ from sioms.reconcile.sensors.plausible import family, physical, termed, without
 from sioms.reconcile.sensors.screen import screen
 from sioms.reconcile.thresholds import BY_CHANCE, DEEP, GAIN, NEARLY, SENSOR, SURE
 
-Step = ladder.Step[SensorModel]
-Found = ladder.Found[Fit, SensorModel]
+Step = selection.Step[SensorModel]
+Found = selection.Found[Fit, SensorModel]
 
 
 @dataclass(slots=True)
@@ -89,7 +89,7 @@ class Searcher(Search[SensorModel]):
         reaches it.
         """
         found = Search.run(self, start)
-        steps = [r for r in found.ladder if r.action == "add"]
+        steps = [r for r in found.path if r.action == "add"]
         if len(steps) < 2 or not self.loud(found.fit) or set(self.terms) & set(self.names):
             return found
         names, footing = self.names, self.weights
@@ -257,7 +257,7 @@ class Searcher(Search[SensorModel]):
         return self.fit(fit.model.without_effect(name))
 
     def simpler(self, fit: Fit, name: str) -> Iterator[tuple[str, str, Fit]]:
-        """Yield look-alikes of fewer numbers in the place of an effect, or of all that it is like."""
+        """Yield confounders of fewer numbers in the place of an effect, or of all that it is like."""
         for other, gone in self._simpler(fit.model, name):
             bare = self.fit(without(fit.model, gone), 0)  # the others stay where they are, or they make up for it
             start = next(iter(screen(self.data, bare, self.weights, fit.model.library[other], self.frozen)), None)
@@ -265,23 +265,23 @@ class Searcher(Search[SensorModel]):
                 yield AND.join(gone), other, self.fit(bare.model.with_effect(other, start.values))
 
     def may_stand(self, new: Fit, name: str) -> bool:
-        """Say whether the numbers of a look-alike can be."""
+        """Say whether the numbers of a confounder can be."""
         return physical(new.model, name)
 
     def _simpler(self, model: SensorModel, name: str) -> list[tuple[str, tuple[str, ...]]]:
-        """Look-alikes of an effect with what each could take the place of, of more numbers in all."""
+        """Confounders of an effect with what each could take the place of, of more numbers in all."""
         lib, out = model.library, []
         if name not in model.effects:
             return []
-        for other in [n for n in lib[name].lookalikes if n in self.names and n not in model.effects]:
-            like = tuple(n for n in model.effects if n in lib[other].lookalikes and n not in self.frozen)
+        for other in [n for n in lib[name].confounders if n in self.names and n not in model.effects]:
+            like = tuple(n for n in model.effects if n in lib[other].confounders and n not in self.frozen)
             for gone in ((name,), tuple(dict.fromkeys((name, *like)))):
                 if lib[other].size(model.count) < sum(lib[n].size(model.count) for n in gone):
                     out.append((other, gone))
         return list(dict.fromkeys(out))
 
     def candidates(self, fit: Fit) -> list[Start]:
-        """Screen every effect that is not in the model; the best few, look-alikes of the best among them."""
+        """Screen every effect that is not in the model; the best few, confounders of the best among them."""
         found: list[Start] = []
         for name in self.names:
             if name in fit.model.effects or name in self.frozen:

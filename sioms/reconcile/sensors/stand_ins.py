@@ -52,13 +52,13 @@ def ruled(searcher: Searcher, found: Found, names: Sequence[str]) -> tuple[str, 
 def _nameless_alike(
     searcher: Searcher, found: Found, names: Sequence[str]
 ) -> Iterator[tuple[tuple[str, ...], Fit, str]]:
-    """Yield names of a model, one or all that a nameless look-alike could take the place of, the fit without, and
+    """Yield names of a model, one or all that a nameless confounder could take the place of, the fit without, and
     that.
     """
     model, lib = found.fit.model, found.fit.model.library
     held = [n for n in model.effects if n in names and n not in searcher.frozen]
     for term in [n for n in searcher.terms if n not in model.effects]:
-        like = tuple(n for n in held if n in lib[term].lookalikes or term in lib[n].lookalikes)
+        like = tuple(n for n in held if n in lib[term].confounders or term in lib[n].confounders)
         for gone in dict.fromkeys((*((n,) for n in like), like) if like else ()):
             yield gone, searcher.fit(without(model, gone), 4), term
 
@@ -98,4 +98,4 @@ def credible(searcher: Searcher, found: Found) -> Found:
         return found
     fit = searcher.levelled(model)
     fit, losses = searcher.eliminate(fit, searcher.loss(fit), [])  # what only served the others
-    return Found(fit, losses, found.ladder)
+    return Found(fit, losses, found.path)

@@ -1,7 +1,7 @@
 """The causes that drifts have, which of them separates from all others, and what is said where none does.
 
 A cause is a direction, or a few, in which the numbers of an axis change together. It is named where a change along it
-leaves nothing else to explain, and where every other cause leaves far more. Look-alikes that the records do not
+leaves nothing else to explain, and where every other cause leaves far more. Confounders that the records do not
 separate are told together, as an open question, with the variable that orders the change.
 """
 

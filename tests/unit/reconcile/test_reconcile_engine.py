@@ -13,7 +13,7 @@ from sioms.reconcile.blocks import heldout
 from sioms.reconcile.engine.evidence import alternative, frequency, outcome, place, unseen
 from sioms.reconcile.engine.fit import Fit, Free, fitted, get, put
 from sioms.reconcile.engine.search import AND, Search, Start, Tried
-from sioms.reconcile.ladder import Found
+from sioms.reconcile.selection import Found
 from sioms.reconcile.thresholds import AXIS
 from sioms.reconcile.verdict import Outcome
 
@@ -126,7 +126,7 @@ def test_the_search_names_what_is_hidden_by_its_simplest_form() -> None:
     found = lines(slope=9.0, wave=5.0).run(Line())
     assert set(found.fit.model.effects) == {"slope", "wave"}
     assert found.fit.model.effects["slope"]["a"] == pytest.approx(9.0, abs=0.6)
-    assert found.ladder[0].action == "start"
+    assert found.path[0].action == "start"
     assert found.fit.ratio == pytest.approx(1.0, abs=0.1)
 
 
@@ -149,7 +149,7 @@ def test_what_no_longer_saves_its_share_leaves_but_the_last_stays() -> None:
     assert [s.effect for s in steps] == ["wave"]
 
 
-def test_a_look_alike_is_open_only_where_it_misses_little() -> None:
+def test_a_confounder_is_open_only_where_it_misses_little() -> None:
     search = lines(slope=9.0)
     fit = search.fit(Line({"slope": {"a": 9.0}}))
     rivals = rules.weighed(

@@ -147,10 +147,10 @@ def test_an_element_more_sensitive_over_its_strip_is_so_in_the_simulated_finger(
         np.testing.assert_allclose(after / before, now / was, rtol=1e-6)
 
 
-def test_look_alikes_are_effects_of_the_library() -> None:
+def test_confounders_are_effects_of_the_library() -> None:
     names = set(library())
     for effect in library().values():
-        assert {*effect.lookalikes, *effect.replaces, *effect.twins} <= names
+        assert {*effect.confounders, *effect.replaces, *effect.twins} <= names
 
 
 def test_a_model_file_reads_back_exactly_and_effects_can_be_switched_off() -> None:

@@ -164,7 +164,7 @@ def test_a_cube_that_hides_in_the_margin_of_the_floor_is_seen_and_noise_is_none(
     """Beside a gain it adds a tenth to the noise; so many rows tell it by ten standard deviations."""
     records = random_loads(0.5, lambda true: 1.02 * true + size * 100.0 * (true / 100.0) ** 3, 600)
     found = analyse(prepare(records, from_table(ONE, "x")[0]), Options(pictures=False))
-    assert next(s for s in found.ladder if s.effect == "gain").ratio < 1.15
+    assert next(s for s in found.path if s.effect == "gain").ratio < 1.15
     assert [e.name for e in found.symbolic] == (["term_cube"] if size else [])
     assert {e.name for e in found.effects} == {"gain"}
 
@@ -183,7 +183,7 @@ def test_a_stand_in_is_larger_at_some_loads_and_a_true_gain_is_not(power: int) -
     assert abs(seen["time"].share) < max(0.2, 2 * seen["time"].half)
 
 
-def test_a_look_alike_too_weak_by_nature_to_be_searched_is_not_ruled_out_by_that() -> None:
+def test_a_confounder_too_weak_by_nature_to_be_searched_is_not_ruled_out_by_that() -> None:
     """A zero that runs off within a minute is no drift of the usual size; the temperature that rose meanwhile must not
     be named alone.
     """

@@ -53,7 +53,7 @@ def test_friction_of_another_form_than_its_name_is_a_law_without_one() -> None:
     law = found.fit.model.effects[LAW]
     for symbol, at in (("s3", -2), ("s5", 1), ("s6", 2), ("s7", 3), ("s8", 4)):
         assert law[symbol] == pytest.approx(0.2 * (at * law["step"]) ** 2, rel=0.1, abs=5e-3), symbol
-    assert found.ladder[-1].action == "form"
+    assert found.path[-1].action == "form"
 
 
 def test_a_name_of_the_right_form_stays() -> None:

@@ -62,7 +62,7 @@ def test_an_effect_says_everything_about_itself(name: str) -> None:
     effect = known()[name]
     assert effect.equation
     assert effect.parameters
-    assert set(effect.lookalikes) <= set(known())
+    assert set(effect.confounders) <= set(known())
     assert set(effect.replaces) <= set(known())
     for p in effect.parameters:
         assert p.lower <= p.start <= p.upper, p.symbol
@@ -70,7 +70,7 @@ def test_an_effect_says_everything_about_itself(name: str) -> None:
     if name in library():
         assert effect.signature
         assert effect.separate
-        assert effect.lookalikes
+        assert effect.confounders
 
 
 @pytest.mark.parametrize("name", sorted(n for n, e in known().items() if e.function is not None))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from sioms.reconcile.ambiguity import lookalikes, settle, told
+from sioms.reconcile.ambiguity import confounders, settle, told
 from sioms.reconcile.blocks import better, formal, heldout, intervals
 from sioms.reconcile.bounces import bent, deepest
 from sioms.reconcile.channels import index_fit, lattice
@@ -155,12 +155,12 @@ def test_an_effect_that_is_not_needed_leaves() -> None:
     assert set(s.run(start).fit.model.effects) == {"viscous"}
 
 
-def test_a_look_alike_that_does_better_takes_the_place_of_what_was_named() -> None:
+def test_a_confounder_that_does_better_takes_the_place_of_what_was_named() -> None:
     s = Searcher(problem(session(AXIS.with_effect("viscous", {"b_extra": 8e-3}))), names=("viscous", "quadratic_drag"))
     fit = s.fit(AXIS.with_effect("quadratic_drag", {"c": 1e-4}))
     found, others = settle(s, Found(fit, s.loss(fit), ()), ())
     assert set(found.fit.model.effects) == {"viscous"}
-    assert [step.action for step in found.ladder] == ["swap"]
+    assert [step.action for step in found.path] == ["swap"]
     assert not any(r.open for r in others)
 
 
@@ -190,11 +190,11 @@ def test_friction_that_rises_with_the_speed_is_no_drop_at_low_speed() -> None:
         assert not leans(AXIS.with_effect(name, {"Fc": 0.12, **beside, "Fs": 0.18, "vs": 0.3}), name)
 
 
-def test_a_richer_law_that_contains_a_named_one_is_no_look_alike_of_it() -> None:
+def test_a_richer_law_that_contains_a_named_one_is_no_confounder_of_it() -> None:
     """A drag with a power of the speed is quadratic at the exponent two: no record could rule it out."""
     for plain in ("viscous", "quadratic_drag"):
-        assert "power_drag" not in lookalikes(plain) and plain not in lookalikes("power_drag")
-    assert "dead_band" in lookalikes("coulomb") and "coulomb" in lookalikes("dead_band")
+        assert "power_drag" not in confounders(plain) and plain not in confounders("power_drag")
+    assert "dead_band" in confounders("coulomb") and "coulomb" in confounders("dead_band")
 
 
 def test_a_residual_that_suits_everything_has_no_name() -> None:
@@ -426,7 +426,7 @@ def test_a_lucky_fit_to_loud_blocks_is_not_sure() -> None:
     assert errors < 0.0
 
 
-def test_the_gate_sees_look_alikes_and_what_is_not_excited() -> None:
+def test_the_gate_sees_confounders_and_what_is_not_excited() -> None:
     one_way = session(AXIS.with_effect("coulomb", {"Fc": 0.05}), 2.0 * T + 0.1 * np.sin(9 * T))
     pairs = {frozenset(p[:2]) for p in gate(problem(one_way), AXIS, ("coulomb", "offset", "viscous")).pairs}
     assert frozenset(("coulomb", "offset")) in pairs

@@ -15,10 +15,10 @@ import pytest
 from sioms.reconcile.axis_verdict import AxisVerdict
 from sioms.reconcile.experiment import Experiment
 from sioms.reconcile.files.axis import read_model
-from sioms.reconcile.ladder import Step
 from sioms.reconcile.report.page import page
 from sioms.reconcile.report.words import as_json, summary, sureness
 from sioms.reconcile.rules import told_apart
+from sioms.reconcile.selection import Step
 from sioms.reconcile.verdict import Estimate, Gap, NamedEffect, Outcome, Place
 
 AXES = Path(__file__).resolve().parents[2] / "physics" / "reconcile_axes"
@@ -30,7 +30,7 @@ def verdict() -> AxisVerdict:
     return AxisVerdict(
         outcome=Outcome.NONE, nominal=model, model=model, effects=(), alternatives=(), symbolic=(),
         gaps=(Gap("force, short windows", "N", 1.0, 1.0, 1.0), Gap("force, closed loop", "N", 2.0, 2.0, 1.9)),
-        ladder=(), missing={}, pairs=(), places=(), ratio=1.0, smoother_share=0.0, burst_share=0.0,
+        path=(), missing={}, pairs=(), places=(), ratio=1.0, smoother_share=0.0, burst_share=0.0,
         effective_samples=100.0, samples=1000, notes=(), rungs=(), findings=(), spectra=None, decisive=None, traces=(),
     )  # fmt: skip
 

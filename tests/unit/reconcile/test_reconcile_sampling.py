@@ -104,7 +104,7 @@ def test_what_has_come_to_lean_on_its_end_leaves() -> None:
     leaning = replace(s, found=replace(s.found, fit=replace(s.found.fit, model=limp)))
     upright = _upright(leaning).found
     assert "elastic" not in upright.fit.model.effects
-    assert (upright.ladder[-1].action, upright.ladder[-1].effect) == ("leave", "elastic")
+    assert (upright.path[-1].action, upright.path[-1].effect) == ("leave", "elastic")
     assert _upright(s) is s
 
 

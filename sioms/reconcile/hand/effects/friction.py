@@ -18,7 +18,7 @@ def _of_slips(
 ) -> SensorEffect:  # fmt: skip
     return SensorEffect(
         name=name, title=title, channel=Channel.MECHANICS, change=change, equation=equation, parameters=quantities,
-        signature=signature, lookalikes=tuple(other for other in NAMES if other != name),
+        signature=signature, confounders=tuple(other for other in NAMES if other != name),
         separate="slips under loads that differ by a factor of four or more",
     )  # fmt: skip
 

@@ -43,7 +43,7 @@ def both(
         own = f"{name}_{finger}"
         likes = (*(like for like in of_both(*alike) if like != own), *(f"{like}_{finger}" for like in alike_there))
         return SensorEffect(
-            name=own, title=title.format(n=finger), channel=channel, parameters=(quantity,), lookalikes=likes,
+            name=own, title=title.format(n=finger), channel=channel, parameters=(quantity,), confounders=likes,
             change=changed(pair, finger, by, quantity.symbol), equation=equation.format(n=finger),
             signature=signature.format(n=finger), separate=separate,
         )  # fmt: skip

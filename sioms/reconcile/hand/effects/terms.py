@@ -59,7 +59,7 @@ def _of(finger: int) -> tuple[SensorEffect, ...]:
     i, n = finger - 1, str(finger)
 
     def made(name: str, equation: str, response: Any, *parameters: Quantity) -> SensorEffect:
-        return term(f"{name}_{n}", equation, response, *parameters, lookalikes=LIKE)
+        return term(f"{name}_{n}", equation, response, *parameters, confounders=LIKE)
 
     return (
         made("farther", f"contact {n} lies c farther from its finger's centre", _farther(i),

@@ -37,4 +37,4 @@ class Found(Generic[F, M]):
 
     fit: F
     losses: Array
-    ladder: tuple[Step[M], ...]
+    path: tuple[Step[M], ...]
