@@ -115,6 +115,10 @@ class SimAxes(TickDriver):
         world = self._world
         if world.found and self._finish_turn(now_ns):
             return
+        if now_ns <= world.last_ns and world.command is not None:  # a verb has left this one out
+            for block in self.blocks:
+                block.stamp_ns = world.last_ns
+            return
         world.bear(now_ns)
         behind = world.leave_out(now_ns)
         if now_ns - world.last_ns <= world.late_ns and behind > world.stride:

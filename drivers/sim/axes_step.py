@@ -73,6 +73,8 @@ def tick_axes(s: SimulatedAxes, now_ns: int, as_of_ns: int, number: int) -> int:
     """Measure, command, publish; ticks that were missed are made up for, and each is published with its own time. What
     that cannot be done for soon is left to the next tick. Returns what the driver has to see to, 0 for nothing.
     """
+    if now_ns <= s.last_ns:
+        return NOT_READY
     behind = int((now_ns - s.last_ns) / s.period_ns)
     beside_ns = now_ns - s.last_ns - behind * s.period_ns
     if 2 * beside_ns > s.period_ns:

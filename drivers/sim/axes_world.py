@@ -73,7 +73,8 @@ class AxesWorld:
             markers=markers,
             capacity=settings.capacity,
             late_max_s=late_max_s(settings),
-            makes_up=lambda: self.command is not None and not self.is_still,
+            makes_up=lambda: self.command is not None,
+            leaves_out=self.leave_out_still,
         )
         self.axes, self.plant = AxisBlock(axes, self.bank), AnalogBlock(plant)
         self.port = BinaryBlock(port[0]) if port else None
@@ -110,11 +111,22 @@ class AxesWorld:
             if fresh.size:
                 self.bank.fault(fresh, why, now_ns)
 
+    def leave_out_still(self, now_ns: int) -> int:
+        """Leave out the ticks before now of a world that stands still, as they change nothing; return their time [ns].
+
+        A verb does so before it acts: the tick behind it may be that of an instant long before, and what the verb begins
+        is made up for from then on. The world keeps to its grid of ticks.
+        """
+        if not self.is_still:
+            return 0
+        self.is_still = False
+        left_ns = max(0, now_ns - self.last_ns) // self.tick_ns * self.tick_ns
+        self.last_ns += left_ns
+        return left_ns
+
     def leave_out(self, now_ns: int) -> int:
         """Leave out the ticks that change nothing; return how many the world is behind then."""
-        if self.is_still:  # the turns that were left out change nothing; the world keeps to its grid of ticks
-            self.last_ns += max(0, (now_ns - self.last_ns) // self.tick_ns - 1) * self.tick_ns
-            self.is_still = False
+        self.leave_out_still(now_ns - self.tick_ns)
         behind = round((now_ns - self.last_ns) / self.tick_ns) if self.command is not None else 0
         if behind > self.stride and self.is_at_rest():  # nor do those that were missed
             self.last_ns, behind, self.is_still = self.last_ns + (behind - 1) * self.tick_ns, 1, False

@@ -44,6 +44,8 @@ class AxisBank(Bank):
         late_max_s: a tick that comes later than this after its predecessor stops all motion [s].
         makes_up: tells whether late ticks are made up for, each at its own time, as those of a simulated device are;
             a verb then acts within a tick after the last, because the axes have come no further.
+        leaves_out: returns how much of the time from the last tick to now nothing has changed in, and is left out [ns,
+            whole ticks]: the last tick was so much later.
         derived: the positions are made of those of other axes, whose own watch finds motors that run the wrong way; an
             axis that is brought back from where these have come is none.
 
@@ -65,6 +67,7 @@ class AxisBank(Bank):
         capacity: int = 16384,
         late_max_s: float = 0.05,
         makes_up: Callable[[], bool] = lambda: False,
+        leaves_out: Callable[[int], int] = lambda now_ns: 0,
         derived: bool = False,
     ) -> None:
         super().__init__(settings, markers, capacity, passing=True)
@@ -98,7 +101,7 @@ class AxisBank(Bank):
         self._measured, self._switches, self._error_max = arrays["measured"], arrays["switches"], arrays["error_max"]
         self._lets_go = np.zeros(self.n, dtype=bool)
         """Axes that press no more when they have come to rest."""
-        self._tick_s, self._makes_up = tick_s, makes_up
+        self._tick_s, self._makes_up, self._leaves_out = tick_s, makes_up, leaves_out
         self._again = False
 
     def plan_ahead(self, count: int = 32) -> int:
@@ -136,6 +139,7 @@ class AxisBank(Bank):
         """
         if not self._seen or self._braked_ns:
             return self._braked_ns or now_ns
+        self._last_ns += self._leaves_out(now_ns)
         if now_ns - self._last_ns > self._late_ns:
             return self._last_ns
         return min(now_ns, self._last_ns + round(self._tick_s * 1e9)) if self._makes_up() else now_ns

@@ -395,6 +395,36 @@ def test_a_world_that_is_late_and_at_rest_has_nothing_to_make_up_for(bench):
     assert mod.bank.rows["position"][0] == pytest.approx(0.02, abs=1e-4)
 
 
+@pytest.mark.parametrize("late_ms", [0, 3, 449, 450])
+def test_what_begins_at_rest_is_not_run_backwards_by_a_tick_of_before(bench, late_ms):
+    """In a process of several devices a tick may come long after its instant, and behind a write."""
+    mod = bench.make(SimAxes, "mod0", {"axis": [SERVO | {"following_error_max": 0.05}], "late_max_s": 2.0})
+    bench.run(0.01)
+    mod.is_at_rest()
+    bench.run(0.5)
+    assert mod.is_at_rest()
+    due_ns = bench.clock_ns + 1_000_000
+    bench.clock_ns += 450_000_000
+    record = np.zeros(1, numpy_dtype(NodeClass.AXIS))
+    record["control_mode"], record["velocity"], record["time"] = int(ControlMode.VELOCITY), 0.05, 9.0
+    at_ns = bench.clock_ns + 380_000
+    mod.bank.take(verdict(mod.bank.judge(record, [0], at_ns)), at_ns)
+    stamps, shown = [], []
+    for at_ns in (
+        due_ns,
+        due_ns + (450 - late_ms) * 1_000_000,
+        *(bench.clock_ns + n * 1_000_000 for n in range(1, 30)),
+    ):
+        mod.tick(at_ns)
+        stamps.append(mod.blocks[0].stamp_ns or at_ns)
+        shown.append((float(mod.bank.rows["commanded_velocity"][0]), float(mod.bank.rows["commanded_position"][0])))
+    assert stamps == sorted(stamps)
+    velocities, positions = zip(*shown, strict=True)
+    assert min(velocities) >= 0.0 and 0.049 < max(velocities) <= 0.05 + 1e-9
+    assert min(positions) >= -1e-9 and max(positions) <= 0.05 * 0.03
+    assert not status(mod) & AxisStatus.FAULT
+
+
 def test_what_describe_has_built_goes_to_one_device_of_the_same_settings(bench):
     def settings(mass):
         return msgspec.convert({"axis": [SERVO | {"motor": {"mass": mass}}]}, SimAxes.Settings)
