@@ -114,8 +114,8 @@ class AxesWorld:
     def leave_out_still(self, now_ns: int) -> int:
         """Leave out the ticks before now of a world that stands still, as they change nothing; return their time [ns].
 
-        A verb does so before it acts: the tick behind it may be that of an instant long before, and what the verb begins
-        is made up for from then on. The world keeps to its grid of ticks.
+        A verb does so before it acts: the tick behind it may be that of an instant long before, and what it begins is
+        made up for from then on. The world keeps to its grid of ticks.
         """
         if not self.is_still:
             return 0
