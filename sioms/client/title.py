@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import re
 import sys
 
 from sioms.protocol.text import printable
@@ -18,9 +17,8 @@ def title() -> str:
     if first == "-c":
         at = len(sys.orig_argv) - len(sys.argv)  # what is behind the code is the program's own
         code = sys.orig_argv[at].removeprefix("-c") if 0 < at < len(sys.orig_argv) else "..."
-        before = re.split("['\"]", code, maxsplit=1)[
-            0
-        ]  # lists, logs and recordings show no literal: it may be a secret
+        quotes = [code.find(quote) for quote in "'\"" if quote in code]
+        before = code[: min(quotes, default=None)]  # lists, logs and recordings show no literal: it may be a secret
         shown = " ".join(before.split()) + ("…" if before != code else "")
         return f'python -c "{printable(shown, MOST)}"'
     if first in ("", "-"):

@@ -107,7 +107,8 @@ def test_the_simulated_controller_answers_as_the_documents_say() -> None:
     now = 1.05
     device.due()
     assert 0 < device.planner.position[0] < 10
-    said = say(b"\x18")
-    assert said.startswith("ALARM:3") and "Grbl 1.1h" in said
+    assert say(b"\x18") == "ALARM:3\r\n" and say(b"?") == "", "half a second behind an alarm it is deaf"
+    now = 1.6
+    assert "Grbl 1.1h" in b"".join(device.due()).decode()
     assert say(b"$J=G91X1F100\n") == "error:8\r\n" and say(b"G0X1\n") == "error:9\r\n"
     assert device.planner.slip[0] > 0
