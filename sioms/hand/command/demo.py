@@ -198,7 +198,7 @@ class Show:
         skills = self._skills
         self.marks.clear()
         found = yield from skills.grasp()
-        self._mark(f"first grasp: {math.degrees(found.grasp.quality):.0f} deg off")
+        self._mark(f"grasped: {math.degrees(found.grasp.quality):.0f} deg off")
         if found.grasp.quality > skills.manner.held_rad:
             found = yield from skills.regrasp(found)
             felt = [frame.time_s for frame in self.film.frames if frame.state == "feel"]
