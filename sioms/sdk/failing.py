@@ -13,8 +13,9 @@ from .stops import Reason, Stop, Stops
 
 TRIES = 4
 """A stop in which an allocation has failed is asked for again, all of it: what it freed on its way may do."""
-_reserve = bytearray(4 << 20)
-"""Address space that nobody has touched, for the stops of a process that gets no more."""
+RESERVE = 4 << 20
+_reserve = bytearray(RESERVE)
+"""Address space that nobody has touched, for the stops of a process that gets no more [bytes]."""
 
 
 def free_reserve() -> None:

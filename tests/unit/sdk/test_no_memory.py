@@ -20,7 +20,8 @@ from own_writes_rig import World, worlds
 
 from sioms.client.command import command
 from sioms.drivers.sim.axes import SimAxes
-from sioms.sdk.failing import free_reserve
+from sioms.sdk import failing
+from sioms.sdk.failing import RESERVE, free_reserve
 
 _testcapi: Any = pytest.importorskip("_testcapi", reason="this interpreter cannot be made to run out of memory")
 
@@ -129,7 +130,9 @@ def _can_have(size: int) -> bool:
     return True
 
 
-def test_what_is_kept_for_failing_is_there_when_nothing_else_is() -> None:
+def test_what_is_kept_for_failing_is_there_when_nothing_else_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    # In this process a test of a driver that fails may have given it up.
+    monkeypatch.setattr(failing, "_reserve", bytearray(RESERVE))
     assert in_a_process(free_and_take) == "before False, after True"
 
 
