@@ -100,20 +100,20 @@ def bent(problem: Problem, fit: Fit, names: Sequence[str]) -> list[Bend]:
 
 
 def loosened(problem: Problem, fit: Fit, names: Sequence[str]) -> dict[tuple[str, str], float]:
-    """Return by how much the 95 % interval of each number is wider, in quadrature, for the exponents of the laws are
-    those of the library to within ``NEIGHBOUR`` only, as far as the records do not tell them.
+    """Return what is added in quadrature to half the 95 % interval of each number, by effect and symbol and in its
+    unit, because an exponent is that of the library to within ``NEIGHBOUR`` only where the records do not tell it.
     """
     columns = dict(_columns(problem, fit, names))
     if not columns or not fit.free:
         return {}
     j = np.column_stack([fit.jacobian, *(_beside_size(fit, b, c) for b, c in columns.items())])
-    k, n = len(fit.free), len(fit.residual)
+    k = len(fit.free)
     each = float(fit.residual @ fit.residual) / effective_samples(fit.residual)
     h = j.T @ j / max(each, 1e-300)
     h[range(k, len(h)), range(k, len(h))] += 1.0 / NEIGHBOUR**2
     wider, tight = np.linalg.pinv(h)[:k, :k], np.linalg.pinv(h[:k, :k])
     half = 1.96 * np.sqrt(np.maximum(np.diag(wider) - np.diag(tight), 0.0))
-    return {(f.effect, f.symbol): float(s * f.scale) for f, s in zip(fit.free, half, strict=True)} if n else {}
+    return {(f.effect, f.symbol): float(s * f.scale) for f, s in zip(fit.free, half, strict=True)}
 
 
 def _beside_size(fit: Fit, bend: Bend, column: Array) -> Array:
