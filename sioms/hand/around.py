@@ -193,23 +193,6 @@ class Around:
         points = [touch.point for touch in self._touches]
         return float(np.hypot(*np.ptp(points, axis=0))) if points else 0.0
 
-    @property
-    def touches(self) -> Sequence[Touch]:
-        """Return all touches that do not contradict each other."""
-        return self._touches
-
-    def outline(self) -> Array:
-        """Return points of the outline that is believed [m], anti-clockwise, shape (n, 2)."""
-        if self.smooth:
-            return self._smooth_outline()[0]
-        sides = sides_through(self._touches)
-        first = np.roll(sides.normals, 1)
-        share = np.linspace(0.0, 1.0, 7)
-        angles = first[:, None] + np.remainder(sides.normals - first, math.tau)[:, None] * share
-        round_ = sides.corner_m * np.stack([np.cos(angles), np.sin(angles)], axis=2)
-        points: Array = (sides.corners[:, None] + round_).reshape(-1, 2)
-        return points
-
     def missed(self, x: float, y: float, psi: float) -> None:
         """Take note of a line along which a finger met nothing."""
         self.tried(x, y, psi)

@@ -25,11 +25,9 @@ class Feeling(Motions):
 
     Attributes:
         taps: how many touches of one finger it has made.
-        felt: what it knows by them, while it feels and afterwards; None before.
     """
 
     taps = 0
-    felt: Around | None = None
     _around: Around | None = None
 
     def _feel_round(self, known: Sequence[Touch]) -> Generator[Setpoint, Reading, Six | None]:
@@ -42,7 +40,6 @@ class Feeling(Motions):
         before_n, self._most_n = self._most_n, self.manner.yield_n
         x, y, direction, d, *_ = self._goal
         around, begun = self._around or Around(), self.taps
-        self.felt = around
         first = None if known else Parallel(x, y, direction, d - 2.0 * FINGER_M, math.inf)
         if self._around is not None:
             around.tried(x, y, direction)
@@ -66,7 +63,6 @@ class Feeling(Motions):
                 break
             if (yield from self._move(target)):  # it was in the way, and may lie elsewhere now
                 seeking = Seeking(around := Around())
-                self.felt = around
                 opened = min(opened + 2.0 * self.manner.clearance_m, self.manner.opening[1] - 1e-3)
             touches: list[Touch] = []
             pushed = None
@@ -78,7 +74,6 @@ class Feeling(Motions):
             if pushed is not None:  # it is beside that finger, and may lie otherwise now
                 self.say(f"finger {index + 1} pushes what its array does not feel, at {_place(pushed)}: felt anew")
                 seeking = Seeking(around := Around())
-                self.felt = around
                 first = Parallel(*pushed, one.direction + 0.5 * math.pi, opened - 2.0 * FINGER_M, math.inf)
                 continue
             if len(touches) < 2:

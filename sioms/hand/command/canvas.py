@@ -67,10 +67,6 @@ def drawn(frame: Frame, outline: Sequence[Point]) -> list[str]:
         canvas.line(side.centre, side.axis)
         if side.contact is not None:
             canvas.loop(circle(side.contact, 1.2e-3, 8))
-    if frame.prober is not None:
-        canvas.loop(circle(frame.prober[0], FINGER_M))
-    for point in outline_at(frame.known.touches, frame.pose):
-        canvas.loop(circle(point, 0.8e-3, 4))
     one, two = frame.sides
     eta = "  ".join("  --  " if math.isnan(e) else f"{math.degrees(e):6.2f}" for e in frame.eta)
     return [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -101,6 +102,17 @@ def test_a_force_beyond_what_fingers_bear_is_refused_before_anything_is_opened(
 ) -> None:
     assert run(_words("grasp", "--force", "40")) == 1
     assert "at most 4 N" in capsys.readouterr().err
+
+
+def test_the_demonstration_ends_as_it_says(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("matplotlib")
+    assert run(_words("demo", "--quiet", "--no-animation", "-o", str(tmp_path))) == 0
+    out = capsys.readouterr().out
+    assert "regrasp" in out and "roll from" in out and "knocks" in out
+    worst = re.search(r"at most ([\d.]+) deg", out)
+    assert worst is not None and float(worst[1]) < 1.0
+    assert "it ended by itself: stale sensor" in out and "finger 2" in out.splitlines()[-2]
+    assert (tmp_path / "hand.png").stat().st_size > 20_000 and not (tmp_path / "hand.gif").exists()
 
 
 def test_a_frame_in_the_terminal_shows_object_fingers_and_forces() -> None:
